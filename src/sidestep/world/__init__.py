@@ -1,0 +1,32 @@
+"""What exists and how it moves: robots, world state, scenario, observation, reward and events."""
+
+from sidestep.world.events import Events
+from sidestep.world.loading import PRESETS, ScenarioError, load_scenario, scenario_to_dict
+from sidestep.world.observation import (
+    goal_seeking,
+    goal_seeking_world,
+    observation_names,
+    observation_size,
+    observe,
+    to_action,
+    to_velocity,
+)
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+__all__ = [
+    "PRESETS",
+    "Events",
+    "Scenario",
+    "ScenarioError",
+    "World",
+    "goal_seeking",
+    "goal_seeking_world",
+    "load_scenario",
+    "observation_names",
+    "observation_size",
+    "observe",
+    "scenario_to_dict",
+    "to_action",
+    "to_velocity",
+]

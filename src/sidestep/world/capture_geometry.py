@@ -1,0 +1,37 @@
+"""The region in which a differential-drive pursuer captures at once, seen in its own frame."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, Scalar
+
+
+def to_pursuer_frame(point: Float[AnyArray, "2"], pose: Float[AnyArray, "3"]) -> Float[Array, "2"]:
+    """z = R(-theta)(p_e - p_d): a world point (m) in the frame of a pursuer at `pose` (x ahead, y left)."""
+    offset = point - pose[:2]
+    cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+    return jnp.stack([cosine * offset[0] + sine * offset[1], -sine * offset[0] + cosine * offset[1]])
+
+
+def usable_angle(evader_speed: Float[AnyArray, ""], pursuer_speed: Float[AnyArray, ""]) -> Scalar:
+    """S = arccos(min(v_e/V, 1)): contact beyond this angle from the pursuer's axis cannot be forced."""
+    return jnp.arccos(jnp.clip(evader_speed / pursuer_speed, 0.0, 1.0))
+
+
+def capture_set_distance(
+    z: Float[AnyArray, "2"], usable: Float[AnyArray, ""], capture_distance: Float[AnyArray, ""]
+) -> Scalar:
+    """Signed distance (m) from the capture set K(l): h = r cos((S - beta')+) - l.
+
+    beta' is the angle between z and the pursuer's axis, front or rear. K is the convex hull of the
+    disc of radius l and the two points (+-l/rho, 0): inside it the pursuer captures by driving
+    straight, whatever the evader does (Ruiz, Murrieta-Cid, Marroquin, IEEE T-RO 2013). Outside the
+    usable angle h is the range, inside it the distance to a tangent line,
+    h = |x| cos S + |y| sin S - l.
+    """
+    ahead, aside = jnp.abs(z[0]), jnp.abs(z[1])
+    squared = ahead**2 + aside**2
+    distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
+    cosine, sine = jnp.cos(usable), jnp.sin(usable)
+    in_front = aside * cosine < ahead * sine
+    return jnp.where(in_front, ahead * cosine + aside * sine, distance) - capture_distance

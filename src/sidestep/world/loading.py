@@ -1,0 +1,229 @@
+"""Scenarios by name or from a file, validated before anything runs."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
+from sidestep.world.scenario import Scenario
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # The paper's numbers; starts and targets at random. They are the defaults of `Scenario`.
+    "paper": {},
+    # The paper's fixed test scene (section IV, tests).
+    "paper-test": {
+        "evader_start": (0.0, 0.0),
+        "obstacle_starts": ((1.5, 0.0),),
+        "pursuer_starts": ((1.0, -0.5, 0.0),),
+        "target_start": (2.5, 0.0),
+    },
+}
+
+_POSITIVE = {
+    "evader_speed", "pursuer_speed", "pursuer_half_axle", "capture_distance", "collision_distance",
+    "reach_distance", "control_period", "arena_side",
+}  # fmt: skip
+_NOT_NEGATIVE = {
+    "pursuer_gain", "obstacle_gain", "reach_reward", "distance_cost",
+    "initial_separation", "obstacle_separation", "target_separation",
+}  # fmt: skip
+_COUNTS = {"pursuer_count": 1, "obstacle_count": 0, "episode_steps": 1}
+_CHOICES = {
+    "action": ("velocity", "heading"),
+    "obstacle_directions": ("fixed", "random"),
+    "frame": ("target", "world"),
+}
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    "obstacle_velocity": (2,),
+    "evader_start": (2,),
+    "target_start": (2,),
+    "pursuer_starts": (None, 3),
+    "obstacle_starts": (None, 2),
+}
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be run: the message names the field, its value and what is allowed."""
+
+
+def _fail(field: str, value: object, allowed: str) -> None:
+    raise ScenarioError(f"scenario field '{field}' = {value!r}: {allowed}")
+
+
+def _check_fields(values: Mapping[str, Any]) -> None:
+    known = [field.name for field in fields(Scenario)]
+    for name in values:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else "."
+            raise ScenarioError(f"unknown scenario field '{name}'{hint} Known fields: {', '.join(sorted(known))}.")
+
+
+def _check_number(name: str, value: Any, test: Callable[[float], bool], allowed: str) -> None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return _fail(name, value, f"a number is needed, {allowed}")
+    if isinstance(value, bool) or not math.isfinite(number) or not test(number):
+        _fail(name, value, f"it must be finite and {allowed}")
+
+
+def _check_values(values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if name in _POSITIVE:
+            _check_number(name, value, lambda number: number > 0.0, "greater than 0")
+        elif name in _NOT_NEGATIVE:
+            _check_number(name, value, lambda number: number >= 0.0, "0 or more")
+        elif name in _COUNTS:
+            least = _COUNTS[name]
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+                _fail(name, value, f"it must be a whole number of at least {least}")
+        elif name in _CHOICES:
+            if value not in _CHOICES[name]:
+                _fail(name, value, f"it must be one of {', '.join(map(repr, _CHOICES[name]))}")
+        elif name in _SHAPES and value is not None:
+            shape = _SHAPES[name]
+            try:
+                array = np.asarray(value, dtype=float)
+            except (TypeError, ValueError):
+                array = np.asarray(np.nan)
+            if name == "obstacle_starts" and array.size == 0:
+                array = array.reshape(0, 2)
+            fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+            if not fits or not np.all(np.isfinite(array)):
+                wanted = " x ".join("n" if n is None else str(n) for n in shape)
+                _fail(name, value, f"it must be {wanted} finite numbers")
+        elif name == "name" and not isinstance(value, str):
+            _fail(name, value, "it must be text")
+
+
+def _check_scene(scenario: Scenario) -> None:
+    """Conflicts between fixed starts, each named."""
+    evader, target = scenario.evader_start, scenario.target_start
+    if scenario.obstacle_starts is not None:
+        for obstacle in scenario.obstacle_starts:
+            for name, point in (("evader_start", evader), ("target_start", target)):
+                if point is not None:
+                    gap = float(jnp.linalg.norm(point - obstacle))
+                    if gap <= float(scenario.collision_distance):
+                        _fail(
+                            name,
+                            point.tolist(),
+                            f"it lies {gap:.4g} m from the obstacle at {obstacle.tolist()}, inside the collision "
+                            f"distance {float(scenario.collision_distance):.4g} m; move one of them",
+                        )
+    if scenario.pursuer_starts is not None and evader is not None:
+        for pose in scenario.pursuer_starts:
+            h = float(
+                capture_set_distance(to_pursuer_frame(evader, pose), scenario.usable_angle, scenario.capture_distance)
+            )
+            if h <= 0.0:
+                _fail(
+                    "evader_start",
+                    evader.tolist(),
+                    f"already captured by the pursuer at {pose.tolist()}: it starts {-h:.4g} m inside the capture "
+                    "set, where the pursuer wins at once; start farther away",
+                )
+    if evader is not None and target is not None:
+        gap = float(jnp.linalg.norm(evader - target))
+        if gap <= float(scenario.reach_distance):
+            _fail("target_start", target.tolist(), f"the evader starts {gap:.4g} m away, so it is reached already")
+
+
+def _build(values: dict[str, Any]) -> Scenario:
+    _check_fields(values)
+    _check_values(values)
+    values = dict(values)
+    for name in _SHAPES:
+        if values.get(name) is not None:
+            shape = _SHAPES[name]
+            array = np.asarray(values[name], dtype=float)
+            values[name] = jnp.asarray(array.reshape(0, shape[1]) if array.size == 0 else array, dtype=float)
+    for starts, count in (("pursuer_starts", "pursuer_count"), ("obstacle_starts", "obstacle_count")):
+        if values.get(starts) is None:
+            continue
+        given = len(values[starts])
+        wanted = values.setdefault(count, given)
+        if wanted > given:
+            _fail(count, wanted, f"only {given} fixed starts are given in '{starts}'; give {wanted}, or none")
+        values[starts] = values[starts][:wanted]
+    for count in _COUNTS:
+        if count in values:
+            values[count] = int(values[count])
+    scenario = Scenario(**values)
+    _check_scene(scenario)
+    if not bool(_some_start_exists(scenario)):
+        raise ScenarioError(
+            "no start satisfies this scenario: 4096 random draws were all rejected. The square of side "
+            f"'arena_side' = {float(scenario.arena_side):.4g} m is too small for 'initial_separation' = "
+            f"{float(scenario.initial_separation):.4g} m, 'obstacle_separation' = "
+            f"{float(scenario.obstacle_separation):.4g} m, 'target_separation' = "
+            f"{float(scenario.target_separation):.4g} m and {scenario.obstacle_count} obstacles of "
+            f"'collision_distance' = {float(scenario.collision_distance):.4g} m; enlarge it or lower one of them"
+        )
+    return scenario
+
+
+@eqx.filter_jit
+def _some_start_exists(scenario: Scenario) -> jax.Array:
+    keys = jax.random.split(jax.random.key(0), 4096)
+    return jnp.any(jax.vmap(lambda key: scenario.accepts(scenario._draw(key)))(keys))
+
+
+def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
+    """A validated scenario: a preset (`paper`, `paper-test`) or a TOML or JSON file, with overrides.
+
+    A file holds fields of `Scenario`; an optional `preset` names the one it starts from (`paper`
+    otherwise). A run's `config.json` can be given too: its `scenario` entry is used. Reducing
+    `obstacle_count` or `pursuer_count` below the fixed starts keeps the first ones.
+
+    **Raises** `ScenarioError` (a `ValueError`) naming the field, its value and what is allowed.
+    """
+    values: dict[str, Any]
+    if str(name_or_path) in PRESETS:
+        values = {**PRESETS[str(name_or_path)], "name": str(name_or_path)}
+    else:
+        path = Path(name_or_path)
+        if not path.is_file():
+            raise ScenarioError(
+                f"no scenario '{name_or_path}': neither a preset ({', '.join(PRESETS)}) nor a file. "
+                "A file is TOML or JSON with fields of sidestep.Scenario."
+            )
+        try:
+            text = path.read_text(encoding="utf-8")
+            content = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        except (UnicodeDecodeError, json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
+            raise ScenarioError(f"scenario file {path} cannot be read: {error}") from None
+        if isinstance(content.get("scenario"), dict):
+            content = content["scenario"]
+        preset = content.pop("preset", "paper")
+        if preset not in PRESETS:
+            _fail("preset", preset, f"it must be one of {', '.join(PRESETS)}")
+        values = {"name": path.stem, **PRESETS[preset], **content}
+    return _build({**values, **overrides})
+
+
+def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
+    """All fields as plain JSON values; `load_scenario` rebuilds the same scenario from them."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, (jax.Array, np.ndarray)):
+            array = np.asarray(value)
+            # The shortest decimal that rounds to the stored float: 0.1574, not 0.15739999711513519.
+            texts = np.vectorize(str, otypes=[object])(array)
+            return np.vectorize(float, otypes=[object])(texts).tolist() if array.size else array.tolist()
+        return value
+
+    return {field.name: plain(getattr(scenario, field.name)) for field in fields(scenario)}

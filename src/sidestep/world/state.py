@@ -1,0 +1,65 @@
+"""The state of the world: where everything is."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, Scalar, real
+
+
+class World(eqx.Module):
+    """Everything that exists, as a pytree. SI units, headings counter-clockwise in rad.
+
+    `evader_velocity` and `wheel_speeds` are what was executed in the last control period (zero after
+    a reset): pursuers may lead the evader, and the evader may measure the pursuers' motion.
+
+    **Attributes:** `evader (2,)`; `pursuers (m, 3)` x, y, heading; `obstacles (k, 4)` x, y, vx, vy;
+    `target (2,)`; `time ()` in s; `evader_velocity (2,)`; `wheel_speeds (m, 2)` left, right.
+    """
+
+    evader: Float[Array, "2"]
+    pursuers: Float[Array, "m 3"]
+    obstacles: Float[Array, "k 4"]
+    target: Float[Array, "2"]
+    time: Scalar
+    evader_velocity: Float[Array, "2"]
+    wheel_speeds: Float[Array, "m 2"]
+
+    def __init__(
+        self,
+        evader: Float[AnyArray, "2"],
+        pursuers: Float[AnyArray, "m 3"],
+        obstacles: Float[AnyArray, "k 4"],
+        target: Float[AnyArray, "2"],
+        time: Float[AnyArray, ""] | float = 0.0,
+        evader_velocity: Float[AnyArray, "2"] | None = None,
+        wheel_speeds: Float[AnyArray, "m 2"] | None = None,
+    ):
+        self.evader = real(evader)
+        self.pursuers = real(pursuers)
+        self.obstacles = real(obstacles)
+        self.target = real(target)
+        self.time = real(time)
+        self.evader_velocity = jnp.zeros_like(self.evader) if evader_velocity is None else real(evader_velocity)
+        self.wheel_speeds = (
+            jnp.zeros((self.pursuers.shape[0], 2), self.pursuers.dtype)
+            if wheel_speeds is None
+            else real(wheel_speeds)
+        )
+
+    @property
+    def pursuer(self) -> Float[Array, "3"]:
+        """The pursuer being steered or asked about: x, y, heading."""
+        return self.pursuers[0]
+
+    def seen_by(self, index: int) -> World:
+        """The same world with pursuer `index` first, which is how a strategy is asked for it."""
+        if index == 0:
+            return self
+        return eqx.tree_at(
+            lambda world: (world.pursuers, world.wheel_speeds),
+            self,
+            (jnp.roll(self.pursuers, -index, axis=0), jnp.roll(self.wheel_speeds, -index, axis=0)),
+        )
