@@ -220,10 +220,8 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
 
     def plain(value: Any) -> Any:
         if isinstance(value, (jax.Array, np.ndarray)):
-            array = np.asarray(value)
             # The shortest decimal that rounds to the stored float: 0.1574, not 0.15739999711513519.
-            texts = np.vectorize(str, otypes=[object])(array)
-            return np.vectorize(float, otypes=[object])(texts).tolist() if array.size else array.tolist()
+            return np.asarray(value).astype(str).astype(float).tolist()
         return value
 
     return {field.name: plain(getattr(scenario, field.name)) for field in fields(scenario)}
