@@ -1,0 +1,250 @@
+"""The run folder: what a run leaves on disk, written so that a kill at any moment leaves a readable folder.
+
+`config.json`, `metrics.jsonl` (one line per episode), `summary.json`, `checkpoints/`, `figures/`,
+`report.html`.
+"""
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+OUTCOMES = ("captured", "collided", "reached", "timed_out")
+"""How an episode ends; exclusive, the first that applies."""
+
+CONVERGENCE_WINDOW = 20
+"""Episodes over which returns are averaged to tell convergence."""
+CONVERGENCE_RETURN = 940.0
+"""Mean return that counts as converged: with +1000 for the target, at least 19 of 20 reached."""
+
+_CONFIG, _METRICS, _SUMMARY = "config.json", "metrics.jsonl", "summary.json"
+
+
+class RunError(ValueError):
+    """A run folder that cannot be used as asked; the message says what to do instead."""
+
+
+def json_safe(value: Any) -> Any:
+    """`value` as plain JSON: arrays become lists, numbers that are not finite become null."""
+    if isinstance(value, Mapping):
+        return {str(key): json_safe(item) for key, item in value.items()}
+    if isinstance(value, (str, bool)) or value is None:
+        return value
+    if isinstance(value, (list, tuple)):
+        return [json_safe(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    array = np.asarray(value)
+    if array.ndim > 0:
+        return [json_safe(item) for item in array]
+    number = array.item()
+    return None if isinstance(number, float) and not math.isfinite(number) else number
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file whole or not at all: a reader, or a restart after a kill, sees the old or the new one.
+
+    Written beside its place, synced to disk, renamed over it, and the folder synced too.
+    """
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(beside, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write `data` as JSON, whole or not at all; numbers that are not finite become null."""
+    text = json.dumps(json_safe(data), indent=2, allow_nan=False)
+    write_bytes(path, (text + "\n").encode())
+
+
+def read_json(path: str | Path) -> Any:
+    """What `write_json` wrote. **Raises** `RunError` when the file is missing or no JSON."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(
+            f"{path} does not exist: {path.parent} is no run folder, or its run never started"
+        ) from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RunError(f"{path} is not readable JSON ({error}); restore it or start another run") from None
+
+
+def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
+    """A new run folder with `config.json` and empty `checkpoints/` and `figures/`.
+
+    **Raises** `RunError` when there is anything in `folder` already: nothing is ever overwritten silently.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise RunError(f"{folder} is a file, not a folder; choose another --out")
+    if folder.is_dir() and any(folder.iterdir()):
+        what = "a run" if (folder / _CONFIG).exists() else "files"
+        raise RunError(
+            f"{folder} already holds {what}, which would be overwritten; continue a run with --resume, "
+            "or choose another --out"
+        )
+    for name in ("checkpoints", "figures"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    write_json(folder / _CONFIG, config)
+    return folder
+
+
+def open_run(folder: str | Path) -> dict[str, Any]:
+    """The configuration of an existing run. **Raises** `RunError` when `folder` holds none."""
+    folder = Path(folder)
+    if not (folder / _CONFIG).is_file():
+        raise RunError(f"{folder} holds no run (no {_CONFIG}); leave out --resume to start one there")
+    for name in ("checkpoints", "figures"):
+        (folder / name).mkdir(exist_ok=True)
+    return read_json(folder / _CONFIG)
+
+
+def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
+    """The episodes of a run in order; none when it has no metrics yet.
+
+    A last line that was cut off by a kill is left out. **Raises** `RunError` naming any other line that
+    cannot be read.
+    """
+    path = Path(folder) / _METRICS
+    if not path.exists():
+        return []
+    *lines, _cut = path.read_bytes().split(b"\n")
+    metrics = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            entry = json.loads(line)
+        except (json.JSONDecodeError, UnicodeDecodeError):
+            entry = None
+        if not isinstance(entry, dict):
+            raise RunError(f"line {number} of {path} is not a JSON object; the file was damaged or edited")
+        metrics.append(entry)
+    return metrics
+
+
+def append_metrics(folder: str | Path, episodes: Iterable[Mapping[str, Any]]) -> None:
+    """Append one line per episode and sync to disk; a last line cut off by a kill is removed first."""
+    path = Path(folder) / _METRICS
+    text = "".join(json.dumps(json_safe(episode), allow_nan=False) + "\n" for episode in episodes)
+    with open(path, "ab+") as file:
+        file.truncate(_end_of_last_line(file))
+        file.write(text.encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _end_of_last_line(file: Any) -> int:
+    """Position after the last line feed, read backwards so that a long file costs nothing."""
+    position = file.seek(0, os.SEEK_END)
+    while position > 0:
+        start = max(0, position - 4096)
+        file.seek(start)
+        found = file.read(position - start).rfind(b"\n")
+        if found >= 0:
+            return start + found + 1
+        position = start
+    return 0
+
+
+def truncate_metrics(folder: str | Path, episodes: int) -> None:
+    """Keep the first `episodes` lines, for a resume from a checkpoint older than the metrics.
+
+    **Raises** `RunError` when there are fewer.
+    """
+    path = Path(folder) / _METRICS
+    *lines, _cut = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    if len(lines) < episodes:
+        raise RunError(f"{path} has {len(lines)} episodes, but the checkpoint was written after {episodes}")
+    write_bytes(path, b"".join(line + b"\n" for line in lines[:episodes]))
+
+
+def moving_mean(values: Sequence[float], window: int = CONVERGENCE_WINDOW) -> np.ndarray:
+    """Mean of the last `window` values at each position, NaN before there are that many."""
+    series = np.asarray(values, dtype=float)
+    means = np.full(series.shape, np.nan)
+    if len(series) >= window:
+        means[window - 1 :] = np.lib.stride_tricks.sliding_window_view(series, window).mean(axis=-1)
+    return means
+
+
+def converged_episode(returns: Sequence[float]) -> int | None:
+    """First episode, from 1, that closes 20 episodes with a mean return of at least 940; None if none does."""
+    closed = np.flatnonzero(moving_mean(returns) >= CONVERGENCE_RETURN)
+    return int(closed[0]) + 1 if len(closed) else None
+
+
+def summarise(metrics: Sequence[Mapping[str, Any]], *, wall_seconds: float, **about: Any) -> dict[str, Any]:
+    """`summary.json` of a run, from its episodes.
+
+    **Arguments:** `metrics` as `read_metrics` returns it; `about`: `scenario`, `shield`, `pursuer`, `seed`,
+    `version`, put in as they are.
+
+    **Returns** counts per outcome, `safe_episodes` (neither captured nor collided), `env_steps` (control
+    periods simulated), `converged_episode`, `final_return` (mean of the last 20 episodes, of all if fewer), the smallest
+    clearances (m), and the shares of control periods in which the shield corrected the action
+    (`intervention_rate`) or could not satisfy its rows (`infeasible_rate`). What needs an episode is null
+    without one.
+    """
+    counts = {name: sum(episode["outcome"] == name for episode in metrics) for name in OUTCOMES}
+    if sum(counts.values()) != len(metrics):
+        unknown = sorted({str(episode["outcome"]) for episode in metrics} - set(OUTCOMES))
+        raise RunError(f"unknown episode outcomes {unknown}; known: {', '.join(OUTCOMES)}")
+    returns = [float(episode["return"]) for episode in metrics]
+    steps = sum(int(episode["steps"]) for episode in metrics)
+
+    def smallest(key: str) -> float | None:
+        values = [float(episode[key]) for episode in metrics if episode.get(key) is not None]
+        return min(values) if values else None
+
+    def share(key: str) -> float | None:
+        return sum(int(episode[key]) for episode in metrics) / steps if steps else None
+
+    return json_safe(
+        {
+            "episodes": len(metrics),
+            "safe_episodes": len(metrics) - counts["captured"] - counts["collided"],
+            **counts,
+            "env_steps": metrics[-1].get("env_steps", steps) if metrics else 0,
+            "wall_seconds": wall_seconds,
+            "converged_episode": converged_episode(returns),
+            "final_return": float(np.mean(returns[-CONVERGENCE_WINDOW:])) if returns else None,
+            "min_pursuer_clearance": smallest("min_pursuer_clearance"),
+            "min_obstacle_clearance": smallest("min_obstacle_clearance"),
+            "intervention_rate": share("interventions"),
+            "infeasible_rate": share("infeasible"),
+            **about,
+        }
+    )
+
+
+def write_summary(folder: str | Path, summary: Mapping[str, Any]) -> None:
+    """Write `summary.json` of a run."""
+    write_json(Path(folder) / _SUMMARY, summary)
+
+
+def read_summary(folder: str | Path) -> dict[str, Any]:
+    """`summary.json` of a run. **Raises** `RunError` when it has none yet."""
+    return read_json(Path(folder) / _SUMMARY)
