@@ -1,0 +1,50 @@
+"""Settings and fixtures of the whole test run.
+
+Nothing here imports `sidestep` at module level: the jaxtyping plugin has to wrap it first.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import pytest
+
+# Mixing float32 with float64, or integers with floats, must be said in the code, not left to promotion.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(params=[False, True], ids=["float32", "float64"])
+def precision(request: pytest.FixtureRequest) -> Iterator[bool]:
+    """Runs a test twice, in float32 and in float64; its value is whether 64 bits are on."""
+    with jax.enable_x64(request.param):
+        yield request.param
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """Runs a test in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def need_program() -> Callable[..., str]:
+    """`need_program("chromium", package="chromium")`: its path; without it skip here, but fail in CI.
+
+    CI installs what the tests need, so a skip there would be a check that silently stopped.
+    """
+
+    def need(*names: str, package: str) -> str:
+        for name in names:
+            if path := shutil.which(name):
+                return path
+        message = f"none of {', '.join(names)} is installed; on Debian: apt-get install {package}"
+        if os.environ.get("CI"):
+            pytest.fail(message)
+        pytest.skip(message)
+
+    return need
