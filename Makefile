@@ -1,0 +1,88 @@
+# Only make and Python 3.11 or newer are needed: the first target that runs creates .venv with everything
+# pinned in requirements.lock, and later ones reuse it.
+VENV := .venv
+PY := $(VENV)/bin/python
+READY := $(VENV)/.ready
+BENCH_VENV := .venv-bench
+BENCH_PY := $(BENCH_VENV)/bin/python
+BENCH_READY := $(BENCH_VENV)/.ready
+PIP_INSTALL := -m pip install -qq --disable-pip-version-check
+TORCH ?= torch==2.13.0
+JOBS ?= 2
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup reproduce test check format lock docs bench clean
+
+help: ## This list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "  ARGS='...' adds options, for example: make reproduce ARGS='--seed 1'"
+
+setup: $(READY) ## Create .venv and install sidestep in it (every other target does so when needed)
+
+$(READY): requirements.lock pyproject.toml
+	@$(PY) -c '' 2>/dev/null || { \
+	  found=; \
+	  for candidate in $(PYTHON) python3.11 python3.12 python3.13 python3.14 python3; do \
+	    if $$candidate -c 'import sys, ensurepip, venv; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	      found=$$candidate; break; \
+	    fi; \
+	  done; \
+	  if [ -z "$$found" ]; then \
+	    echo "make: no Python 3.11 or newer with its venv module was found (tried python3.11 to python3.14 and" >&2; \
+	    echo "python3). Install one (Debian, Ubuntu: apt-get install python3 python3-venv), or name yours:" >&2; \
+	    echo "make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; \
+	    exit 1; \
+	  fi; \
+	  echo "Creating $(VENV) with $$($$found --version)"; \
+	  $$found -m venv --clear $(VENV) || exit 1; \
+	}
+	@echo "Installing what requirements.lock pins (some 300 MB; a few minutes the first time)"
+	@$(PY) $(PIP_INSTALL) --require-hashes -r requirements.lock
+	@$(PY) $(PIP_INSTALL) --no-deps --no-build-isolation -e .
+	@touch $@
+
+reproduce: $(READY) ## Train and test as the paper does, without a shield, with its shield and with ours
+	$(VENV)/bin/sidestep reproduce --out runs/reproduce $(ARGS)
+
+test: $(READY) ## Run the tests (those marked slow: make test ARGS='-m slow')
+	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)
+
+check: $(READY) ## Format, lint, import order, types, documentation, lock
+	$(PY) -m ruff format --check .
+	$(PY) -m ruff check .
+	$(VENV)/bin/lint-imports
+	$(PY) -m pyright
+	$(PY) -m mkdocs build --strict --quiet
+	@if grep -nE '://|--(extra-)?index-url|--find-links' requirements.lock; then \
+	  echo "requirements.lock must hold no addresses: write it with 'make lock'" >&2; exit 1; \
+	fi
+
+format: $(READY) ## Format the code and mend what the linter can
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+lock: ## Write requirements.lock anew after a change of dependencies (make lock ARGS=--upgrade)
+	$(VENV)/bin/uv pip compile pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest \
+	  --python-version 3.11 --generate-hashes --no-header --no-annotate --no-emit-index-url --quiet \
+	  -o requirements.lock $(ARGS)
+
+docs: $(READY) ## Build the documentation into site/
+	$(PY) -m mkdocs build --strict
+
+bench: $(BENCH_READY) ## Time the training loop against Stable-Baselines3
+	$(BENCH_PY) benchmarks/learning.py $(ARGS)
+
+# An environment of its own keeps PyTorch out of the main one. PyTorch goes first, in one exact version, so
+# that nothing later pulls in another build of it.
+$(BENCH_READY): requirements.lock pyproject.toml | $(READY)
+	@echo "Creating $(BENCH_VENV) with PyTorch and Stable-Baselines3 (about 1 GB)"
+	@$(PY) -m venv --clear $(BENCH_VENV)
+	@$(BENCH_PY) $(PIP_INSTALL) $(TORCH)
+	@$(BENCH_PY) $(PIP_INSTALL) --require-hashes -r requirements.lock
+	@$(BENCH_PY) $(PIP_INSTALL) --no-build-isolation -e '.[bench]'
+	@touch $@
+
+clean: ## Remove the environments and everything built; runs/ stays
+	rm -rf $(VENV) $(BENCH_VENV) site build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
