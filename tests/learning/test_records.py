@@ -46,7 +46,7 @@ def episode(number=1, outcome="reached", total=990.0, steps=100, **more):
 
 def test_existing_run_is_never_overwritten(tmp_path):
     run = create_run(tmp_path / "run", {"seed": 1})
-    with pytest.raises(RunError, match="--resume.*--out"):
+    with pytest.raises(RunError, match=r"--resume.*--out"):
         create_run(run, {"seed": 2})
     assert open_run(run)["seed"] == 1
     (tmp_path / "other").mkdir()
@@ -59,7 +59,8 @@ def test_existing_run_is_never_overwritten(tmp_path):
 
 def test_empty_folder_may_be_used(tmp_path):
     assert open_run(create_run(tmp_path, {"seed": 3})) == {"seed": 3}
-    assert (tmp_path / "checkpoints").is_dir() and (tmp_path / "figures").is_dir()
+    assert (tmp_path / "checkpoints").is_dir()
+    assert (tmp_path / "figures").is_dir()
 
 
 def test_resuming_where_no_run_is_says_so(tmp_path):
@@ -105,7 +106,8 @@ def test_kill_in_the_middle_of_writing_leaves_a_whole_file(tmp_path):
         child.send_signal(signal.SIGKILL)
         child.wait()
         content = read_json(path)
-        assert content["round"] >= 1 and set(content["payload"]) == {content["round"]}
+        assert content["round"] >= 1
+        assert set(content["payload"]) == {content["round"]}
 
 
 def test_metrics_line_cut_by_a_kill_is_dropped_and_not_glued_to_the_next(tmp_path):
@@ -140,7 +142,7 @@ def test_resume_from_an_older_checkpoint_drops_later_episodes(tmp_path):
     assert [entry["episode"] for entry in read_metrics(tmp_path)] == [1, 2, 3]
     append_metrics(tmp_path, [episode(4), episode(5)])
     assert (tmp_path / "metrics.jsonl").read_bytes() == whole
-    with pytest.raises(RunError, match="5 episodes.*after 6"):
+    with pytest.raises(RunError, match=r"5 episodes.*after 6"):
         truncate_metrics(tmp_path, 6)
 
 
@@ -171,7 +173,8 @@ def test_convergence_needs_nineteen_of_twenty():
     assert converged_episode([990.0] * 19) is None
     assert converged_episode([990.0] * 20) == 20
     assert converged_episode([]) is None
-    assert np.isnan(moving_mean([1.0] * 20)[:19]).all() and moving_mean([1.0] * 20)[19] == 1.0
+    assert np.isnan(moving_mean([1.0] * 20)[:19]).all()
+    assert moving_mean([1.0] * 20)[19] == 1.0
 
 
 def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
@@ -183,18 +186,21 @@ def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
     ]
     about = {"scenario": "paper", "shield": "game", "pursuer": "nash", "seed": 0, "version": "0"}
     summary = summarise(metrics, wall_seconds=1.5, **about)
-    assert summary["safe_episodes"] == 27 and summary["episodes"] == 29
+    assert summary["safe_episodes"] == 27
+    assert summary["episodes"] == 29
     assert [summary[name] for name in ("captured", "collided", "reached", "timed_out")] == [1, 1, 26, 1]
-    assert (
-        summary["env_steps"] == 2900
-        and summary["intervention_rate"] == 0.1
-        and summary["infeasible_rate"] == 0.01
-    )
-    assert summary["min_pursuer_clearance"] == 0.05 and summary["min_obstacle_clearance"] == 0.4
-    assert summary["final_return"] == 990.0 and summary["converged_episode"] == 23
+    assert summary["env_steps"] == 2900
+    assert summary["intervention_rate"] == 0.1
+    assert summary["infeasible_rate"] == 0.01
+    assert summary["min_pursuer_clearance"] == 0.05
+    assert summary["min_obstacle_clearance"] == 0.4
+    assert summary["final_return"] == 990.0
+    assert summary["converged_episode"] == 23
     write_summary(tmp_path, summary)
     assert read_summary(tmp_path) == summary
     empty = summarise([], wall_seconds=0.0, **about)
-    assert empty["episodes"] == 0 and empty["final_return"] is None and empty["intervention_rate"] is None
+    assert empty["episodes"] == 0
+    assert empty["final_return"] is None
+    assert empty["intervention_rate"] is None
     with pytest.raises(RunError, match="crashed"):
         summarise([episode(1, "crashed")], wall_seconds=0.0, **about)

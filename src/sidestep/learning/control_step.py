@@ -43,7 +43,7 @@ def decide(scenario: Scenario, policy: Callable[..., Any], world: World) -> Floa
     action = jnp.asarray(policy(observe(scenario, world)))
     if action.shape != (2,):
         raise ValueError(
-            f"a policy answers one observation with an action of shape (2,); this one answered with {action.shape}"
+            f"a policy must answer one observation with an action of shape (2,), not {action.shape}"
         )
     action = real(action)
     return jnp.where(jnp.all(jnp.isfinite(action)), to_velocity(scenario, world, action), jnp.nan)
@@ -62,7 +62,7 @@ def pursue(
         wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
         if wheels.shape != (2,):
             raise ValueError(
-                f"a pursuer answers with wheel speeds (left, right) of shape (2,); this one answered with {wheels.shape}"
+                f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
             )
         answers.append(real(wheels))
     return jnp.stack(answers)

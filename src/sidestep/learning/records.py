@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 OUTCOMES = ("captured", "collided", "reached", "timed_out")
 """How an episode ends; exclusive, the first that applies."""
@@ -181,7 +182,7 @@ def truncate_metrics(folder: str | Path, episodes: int) -> None:
     write_bytes(path, b"".join(line + b"\n" for line in lines[:episodes]))
 
 
-def moving_mean(values: Sequence[float], window: int = CONVERGENCE_WINDOW) -> np.ndarray:
+def moving_mean(values: ArrayLike, window: int = CONVERGENCE_WINDOW) -> np.ndarray:
     """Mean of the last `window` values at each position, NaN before there are that many."""
     series = np.asarray(values, dtype=float)
     means = np.full(series.shape, np.nan)
@@ -190,21 +191,23 @@ def moving_mean(values: Sequence[float], window: int = CONVERGENCE_WINDOW) -> np
     return means
 
 
-def converged_episode(returns: Sequence[float]) -> int | None:
-    """First episode, from 1, that closes 20 episodes with a mean return of at least 940; None if none does."""
+def converged_episode(returns: ArrayLike) -> int | None:
+    """First episode, from 1, that closes 20 episodes with a mean return of at least 940, if one does."""
     closed = np.flatnonzero(moving_mean(returns) >= CONVERGENCE_RETURN)
     return int(closed[0]) + 1 if len(closed) else None
 
 
-def summarise(metrics: Sequence[Mapping[str, Any]], *, wall_seconds: float, **about: Any) -> dict[str, Any]:
+def summarise(
+    metrics: Sequence[Mapping[str, Any]], *, wall_seconds: float | int, **about: Any
+) -> dict[str, Any]:
     """`summary.json` of a run, from its episodes.
 
     **Arguments:** `metrics` as `read_metrics` returns it; `about`: `scenario`, `shield`, `pursuer`, `seed`,
     `version`, put in as they are.
 
     **Returns** counts per outcome, `safe_episodes` (neither captured nor collided), `env_steps` (control
-    periods simulated), `converged_episode`, `final_return` (mean of the last 20 episodes, of all if fewer), the smallest
-    clearances (m), and the shares of control periods in which the shield corrected the action
+    periods simulated), `converged_episode`, `final_return` (mean of the last 20 episodes, of all if fewer),
+    the smallest clearances (m), and the shares of control periods in which the shield corrected the action
     (`intervention_rate`) or could not satisfy its rows (`infeasible_rate`). What needs an episode is null
     without one.
     """

@@ -1,0 +1,99 @@
+"""What can honestly be said from a finite number of episodes or seeds."""
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+
+def _check_level(level: float | int) -> None:
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level = {level!r}: it must lie between 0 and 1, 0.95 for a 95 % interval")
+
+
+def wilson_interval(count: int, total: int, level: float | int = 0.95) -> tuple[float, float]:
+    """Wilson's score interval for the rate behind `count` events in `total` trials.
+
+    (p + z^2/2n +- z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n), with p = count/n and z the normal quantile
+    (Wilson, JASA 1927). Unlike p +- z sqrt(p (1 - p)/n) it is never empty at zero events. No trials say
+    nothing: (0, 1).
+
+    **Raises** `ValueError` unless 0 <= count <= total and 0 < level < 1.
+    """
+    _check_level(level)
+    if not 0 <= count <= total:
+        raise ValueError(f"count = {count!r} of total = {total!r}: counts must satisfy 0 <= count <= total")
+    if total == 0:
+        return 0.0, 1.0
+    z = NormalDist().inv_cdf(0.5 + level / 2.0)
+    rate, shrink = count / total, 1.0 + z * z / total
+    centre = (rate + z * z / (2.0 * total)) / shrink
+    half = z / shrink * math.sqrt(rate * (1.0 - rate) / total + (z / (2.0 * total)) ** 2)
+    # At the ends the exact values are 0 and 1; rounding must not leave the unit interval or the rate out.
+    return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
+
+
+def zero_event_bound(total: int, level: float | int = 0.95) -> float:
+    """Upper confidence bound of a rate after no event in `total` trials: 1 - (1 - level)^(1/total).
+
+    The rule of three, 3/total at 95 %, is its approximation from above. No trials say nothing: 1.
+    """
+    _check_level(level)
+    if total < 0:
+        raise ValueError(f"total = {total!r}: it must be 0 or more")
+    return 1.0 if total == 0 else -math.expm1(math.log1p(-level) / total)
+
+
+def interquartile_mean(values: ArrayLike) -> float:
+    """Mean of the middle half: a quarter of the values (rounded down) is cut off at each end.
+
+    Less noisy than the median, less fooled by outliers than the mean (Agarwal et al., NeurIPS 2021). NaN for
+    no values.
+    """
+    ordered = np.sort(np.asarray(values, dtype=float).reshape(-1))
+    cut = len(ordered) // 4
+    return float(np.mean(ordered[cut : len(ordered) - cut])) if len(ordered) else math.nan
+
+
+class Interval(NamedTuple):
+    """An estimate and the interval around it."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+def stratified_bootstrap(
+    strata: Sequence[ArrayLike],
+    statistic: Callable[[Float[np.ndarray, "n"]], float] = interquartile_mean,
+    *,
+    level: float | int = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Percentile bootstrap interval of `statistic` over all values, resampled within each stratum.
+
+    A stratum is what must not be mixed in resampling, a task or a scenario say, and holds one value per seed
+    (Agarwal et al., NeurIPS 2021). The same `seed` gives the same interval.
+
+    **Raises** `ValueError` when there is no stratum, an empty one, or a value that is not finite.
+    """
+    _check_level(level)
+    groups = [np.asarray(stratum, dtype=float).reshape(-1) for stratum in strata]
+    if not groups or any(len(group) == 0 for group in groups):
+        raise ValueError("every stratum needs at least one value")
+    if not all(np.all(np.isfinite(group)) for group in groups):
+        raise ValueError("a value is not finite; leave such runs out and report how many there were")
+    generator = np.random.default_rng(seed)
+    draws = [
+        statistic(
+            np.concatenate([group[generator.integers(len(group), size=len(group))] for group in groups])
+        )
+        for _ in range(resamples)
+    ]
+    low, high = np.quantile(draws, [0.5 - level / 2.0, 0.5 + level / 2.0])
+    return Interval(float(statistic(np.concatenate(groups))), float(low), float(high))
