@@ -1,0 +1,141 @@
+"""The capture game: who wins, how far the evader is from being caught, and how well each side can play.
+
+Isaacs' equations for an omnidirectional evader and a differential-drive pursuer (Ruiz, Murrieta-Cid,
+Marroquin, "Time-Optimal Motion Strategies for Capturing an Omnidirectional Evader Using a
+Differential Drive Robot", IEEE T-RO 2013), in the pursuer's frame: z = (ahead, left) of the evader.
+For a unit vector n, the direction in which the evader gains,
+
+    n.z' = n.u - v n_x + omega sigma,    sigma = n_x z_y - n_y z_x,
+
+so that the best the pursuer can do, with |v| + b |omega| <= V, is n.z' = n.u - V max(|n_x|, |sigma|/b).
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep.world.capture_geometry import capture_set_distance, usable_angle
+from sidestep.world.scenario import Scenario
+
+
+def _sign(value: Float[AnyArray, ""]) -> Scalar:
+    """+1 or -1, and +1 at 0: a side must be chosen there too."""
+    return jnp.where(jnp.asarray(value) < 0.0, -1.0, 1.0).astype(jnp.asarray(value).dtype)
+
+
+def turning_moment(z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
+    """sigma = n_x z_y - n_y z_x (m): moment of n about the pursuer, so that turning adds omega sigma to n.z'."""
+    return normal[0] * z[1] - normal[1] * z[0]
+
+
+class CaptureGame(eqx.Module):
+    """One evader against one differential-drive pursuer in the unbounded plane.
+
+    **Arguments:** `evader_speed` v_e and `pursuer_speed` V (wheel rim), m/s; `half_axle` b and
+    `capture_distance` l, m. All are traced, so another value never recompiles. b may be 0 (a pursuer that
+    turns at no cost) and the evader may be the faster one.
+
+    Methods take one point z (m) in the pursuer's frame; `jax.vmap` them over many.
+    """
+
+    evader_speed: Scalar = eqx.field(converter=real)
+    pursuer_speed: Scalar = eqx.field(converter=real)
+    half_axle: Scalar = eqx.field(converter=real)
+    capture_distance: Scalar = eqx.field(converter=real)
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> CaptureGame:
+        """The game that a scenario's evader plays against each of its pursuers."""
+        return cls(
+            scenario.evader_speed,
+            scenario.pursuer_speed,
+            scenario.pursuer_half_axle,
+            scenario.capture_distance,
+        )
+
+    @property
+    def usable_angle(self) -> Scalar:
+        """S = arccos(v_e/V), rad: contact can be forced only closer than this to the pursuer's axis."""
+        return usable_angle(self.evader_speed, self.pursuer_speed)
+
+    @property
+    def largest_capture_distance(self) -> Scalar:
+        """l_max = b rho^2 / sqrt(1 - rho^2), m: up to this capture distance the evader can escape forever.
+
+        Infinite when the evader is at least as fast, zero for a slower one when b = 0.
+        """
+        ratio = self.evader_speed / self.pursuer_speed
+        slower = ratio < 1.0
+        root = jnp.sqrt(jnp.where(slower, (1.0 - ratio) * (1.0 + ratio), 1.0))
+        return jnp.where(slower, self.half_axle * ratio**2 / root, jnp.inf)
+
+    @property
+    def evader_can_escape(self) -> Flag:
+        """Whether an evader outside the capture set K(l) can stay free forever: tan S <= rho b / l."""
+        return (self.capture_distance <= self.largest_capture_distance) & (
+            self.largest_capture_distance > 0.0
+        )
+
+    def barrier(
+        self, z: Float[AnyArray, "2"], side: Float[AnyArray, ""] | float | None = None
+    ) -> tuple[Scalar, Float[Array, "2"]]:
+        """Signed distance h (m) from the capture set and its unit normal n, in the pursuer's frame.
+
+        h = r cos((S - beta')+) - l, with beta' the angle between z and the pursuer's axis, front or rear.
+        Beyond the usable angle h is the range and n points away from the pursuer. In front and behind, h is
+        the distance to a line tangent to the disc of radius l, and there are two: `side` (+1 left, -1
+        right) picks the one to follow, h = |x| cos S + side y sin S - l. By default it is the evader's own
+        side, +1 on the axis, and then h is the distance from K(l) itself.
+
+        For 0 <= h <= l_max - l this is the value of the game: the evader that follows n never lets the
+        pursuer closer than l + h (T-RO 2013; the value of the smallest distance).
+        """
+        z = real(z)
+        usable = self.usable_angle
+        cosine, sine = jnp.cos(usable), jnp.sin(usable)
+        own_side = _sign(z[1])
+        chosen = own_side if side is None else _sign(real(side))
+        in_front = jnp.abs(z[1]) * cosine < jnp.abs(z[0]) * sine
+        squared = jnp.sum(z**2)
+        apart = squared > 0.0
+        # At the pursuer's very centre the tangent's direction, a limit from in front, is as good as any.
+        away = z / jnp.sqrt(jnp.where(apart, squared, 1.0))
+        tangent = jnp.stack([_sign(z[0]) * cosine, chosen * sine])
+        normal = jnp.where(in_front | ~apart, tangent, away)
+        value = capture_set_distance(z, usable, self.capture_distance)
+        other_tangent = in_front & (chosen != own_side)
+        return jnp.where(other_tangent, jnp.sum(tangent * z) - self.capture_distance, value), normal
+
+    def _turning_gain(self, z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
+        """|sigma|/b; infinite for a pursuer that turns at no cost, unless turning gains nothing."""
+        moment = jnp.abs(turning_moment(z, normal))
+        axle = self.half_axle
+        free = jnp.where(moment > 0.0, jnp.inf, 0.0)
+        return jnp.where(axle > 0.0, moment / jnp.where(axle > 0.0, axle, 1.0), free)
+
+    def pursuit_rate(self, z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
+        """V max(|n_x|, |sigma|/b), m/s: the fastest the pursuer can lower n.z on its own.
+
+        The evader that moves with n.u >= pursuit_rate loses no ground against any admissible wheel speeds.
+        """
+        z, normal = real(z), real(normal)
+        return self.pursuer_speed * jnp.maximum(jnp.abs(normal[0]), self._turning_gain(z, normal))
+
+    def steer_against(self, z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+        """Wheel speeds (left, right; m/s) that attain `pursuit_rate` against the direction `normal`.
+
+        Straight at V sign(n_x) when |n_x| >= |sigma|/b, else a turn in place at V/b that lowers sigma.
+        """
+        z, normal = real(z), real(normal)
+        straight = jnp.abs(normal[0]) >= self._turning_gain(z, normal)
+        forward = jnp.full(2, _sign(normal[0]))
+        # omega = -(V/b) sign(sigma): the right wheel runs forward to turn left.
+        turn = _sign(turning_moment(z, normal)) * jnp.array([1.0, -1.0], z.dtype)
+        return self.pursuer_speed * jnp.where(straight, forward, turn)
+
+    def pursuer_saddle(self, z: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+        """Wheel speeds (left, right; m/s) of the pursuer's saddle-point law at z."""
+        return self.steer_against(z, self.barrier(z)[1])

@@ -1,0 +1,168 @@
+"""Pursuer strategies behind one interface: given the world, the wheel speeds for one control period."""
+
+from __future__ import annotations
+
+import abc
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sidestep._arrays import Scalar, real
+from sidestep.pursuit.game import CaptureGame
+from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
+from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.robots import limit_wheels, wheels_from_body
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+_INTERCEPT_STEPS = 8
+
+
+class Pursuer(eqx.Module):
+    """A strategy for one differential-drive pursuer. It steers `world.pursuer` and may look at all else.
+
+    Subclasses define `steer`. Calling the strategy clips its answer to the wheel limits, so that no
+    strategy can cheat, by rounding or otherwise; wheel speeds that are not finite become a stop.
+    """
+
+    @abc.abstractmethod
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        """Wanted wheel rim speeds (left, right; m/s) of `world.pursuer` for the next control period."""
+
+    def __call__(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        """Wheel rim speeds (left, right; m/s) of `world.pursuer`, each within [-V, V]."""
+        return limit_wheels(self.steer(scenario, world, key), scenario.pursuer_speed)
+
+
+def _toward(
+    scenario: Scenario, turn: Scalar, end: Scalar | float = 1.0, turning_share: float = 1.0
+) -> Float[Array, "2"]:
+    return turn_and_drive(
+        turn,
+        real(end),
+        scenario.pursuer_speed,
+        scenario.pursuer_half_axle,
+        scenario.control_period,
+        turning_share=turning_share,
+    )
+
+
+@final
+class Nash(Pursuer):
+    """The saddle point of the capture game: no pursuer does better against an evader that plays well.
+
+    Where capture is possible it plays the time-optimal game. Where it is not, "Nash" in capture time
+    means nothing (every choice takes forever), so it plays for the smallest distance: from farther out it
+    turns its nearer end to the evader and drives, which brings it to the stand-off at b cot S; there,
+    within h_max of the capture set, it drives straight, which forces the distance down to l_max and no
+    lower. Beside the usable part, where driving on would only pass the evader by, it turns again.
+    """
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        game = CaptureGame.of(scenario)
+        z = to_pursuer_frame(world.evader, world.pursuer)
+        value, normal = game.barrier(z)
+        end, turn = nearer_end(bearing_of(z))
+        closing = _toward(scenario, turn, end)
+        # The stand-off is only reached in infinite time; one period's driving away is near enough to strike.
+        reach = scenario.pursuer_speed * scenario.control_period
+        near = value <= jnp.maximum(game.largest_capture_distance - scenario.capture_distance, 0.0) + reach
+        strike = near & (jnp.abs(turn) <= game.usable_angle)
+        return jnp.where(strike, game.steer_against(z, normal), closing)
+
+
+@final
+class TurnThenDrive(Pursuer):
+    """Turns in place until it faces the evader, then drives straight at it, correcting as it goes."""
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        return _toward(scenario, bearing_of(to_pursuer_frame(world.evader, world.pursuer)))
+
+
+@final
+class TurnWhileDriving(Pursuer):
+    """Never stops driving forward: turns toward the evader on arcs no tighter than about its inner wheel."""
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        bearing = bearing_of(to_pursuer_frame(world.evader, world.pursuer))
+        return _toward(scenario, bearing, turning_share=0.5)
+
+
+@final
+class PurePursuit(Pursuer):
+    """Drives, at full speed, the arc through the evader that starts along its own axis; reverses too.
+
+    The arc's curvature is 2 z_y/|z|^2, forward and backward alike (Coulter, "Implementation of the Pure
+    Pursuit Path Tracking Algorithm", CMU-RI-TR-92-01, 1992).
+    """
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        z = to_pursuer_frame(world.evader, world.pursuer)
+        axle = scenario.pursuer_half_axle
+        # v = V/(1 + b|curvature|) and omega = curvature v, written without the division by |z|^2.
+        squared = jnp.sum(z**2)
+        total = squared + 2.0 * axle * jnp.abs(z[1])
+        apart = total > 0.0
+        scale = scenario.pursuer_speed / jnp.where(apart, total, 1.0) * jnp.where(z[0] < 0.0, -1.0, 1.0)
+        return wheels_from_body(jnp.where(apart, scale * squared, 0.0), 2.0 * scale * z[1], axle)
+
+
+@final
+class Interceptor(Pursuer):
+    """Drives at the point where it would meet the evader, were the evader to keep its velocity.
+
+    The time to that point counts the turn in place, with the nearer end, and the straight drive after
+    it; a few fixed-point steps find it. Against an evader too fast to be met it aims far ahead.
+    """
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        z = to_pursuer_frame(world.evader, world.pursuer)
+        ahead = to_pursuer_frame(world.evader + world.evader_velocity, world.pursuer) - z
+        time = jnp.zeros_like(z[0])
+        for _ in range(_INTERCEPT_STEPS):
+            point = z + ahead * time
+            _, turn = nearer_end(bearing_of(point))
+            distance = jnp.sqrt(jnp.maximum(jnp.sum(point**2), jnp.finfo(point.dtype).tiny))
+            driving = jnp.maximum(distance - scenario.capture_distance, 0.0)
+            time = (driving + scenario.pursuer_half_axle * jnp.abs(turn)) / scenario.pursuer_speed
+        end, turn = nearer_end(bearing_of(z + ahead * time))
+        return _toward(scenario, turn, end)
+
+
+@final
+class Random(Pursuer):
+    """Wheel speeds drawn uniformly from [-V, V], independently at each control period."""
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        speed = scenario.pursuer_speed
+        return speed * jax.random.uniform(key, (2,), dtype=speed.dtype, minval=-1.0, maxval=1.0)
+
+
+@final
+class Still(Pursuer):
+    """Never moves."""
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        return jnp.zeros_like(world.pursuer[:2])
+
+
+PURSUERS: dict[str, type[Pursuer]] = {
+    "nash": Nash,
+    "turn-then-drive": TurnThenDrive,
+    "turn-while-driving": TurnWhileDriving,
+    "pure-pursuit": PurePursuit,
+    "interceptor": Interceptor,
+    "random": Random,
+    "still": Still,
+}
+"""Every strategy by the name the command line knows it by."""
+
+
+def make_pursuer(name: str) -> Pursuer:
+    """The pursuer strategy called `name`; a ValueError lists the names there are."""
+    if name not in PURSUERS:
+        raise ValueError(f"unknown pursuer {name!r}; known pursuers: {', '.join(PURSUERS)}")
+    return PURSUERS[name]()

@@ -1,0 +1,40 @@
+"""Wheel speeds that bring a differential drive onto a bearing and along it, held for one control period."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, Scalar
+from sidestep.world.robots import wheels_from_body
+
+
+def bearing_of(z: Float[AnyArray, "2"]) -> Scalar:
+    """Direction (rad) of z, in [-pi, pi]; 0 at the origin, with a finite derivative there."""
+    apart = jnp.any(z != 0.0)
+    return jnp.arctan2(jnp.where(apart, z[1], 0.0), jnp.where(apart, z[0], 1.0))
+
+
+def nearer_end(bearing: Float[AnyArray, ""]) -> tuple[Scalar, Scalar]:
+    """Which end points at `bearing` sooner, +1 front or -1 rear, and the turn (rad) that brings it there."""
+    behind = jnp.abs(bearing) > jnp.pi / 2.0
+    turn = jnp.where(behind, bearing - jnp.where(bearing < 0.0, -jnp.pi, jnp.pi), bearing)
+    return jnp.where(behind, -1.0, 1.0).astype(turn.dtype), turn
+
+
+def turn_and_drive(
+    turn: Float[AnyArray, ""],
+    end: Float[AnyArray, ""],
+    rim_speed: Float[AnyArray, ""],
+    half_axle: Float[AnyArray, ""],
+    period: Float[AnyArray, ""],
+    turning_share: float = 1.0,
+) -> Float[Array, "2"]:
+    """Turn by `turn` (rad) and drive with what is left of the wheels; `end` +1 drives forward, -1 backward.
+
+    Within one control period the turn is exact when it can be: turning on at full speed past the wanted
+    heading would only make the robot chatter about it. `turning_share` bounds the part of the wheel speed
+    spent on turning: 1 turns in place for as long as the turn takes more than a period, 1/2 keeps the
+    inner wheel from running backward, so that the robot drives an arc.
+    """
+    fastest = turning_share * rim_speed / half_axle
+    turn_rate = jnp.clip(turn / period, -fastest, fastest)
+    return wheels_from_body(end * (rim_speed - half_axle * jnp.abs(turn_rate)), turn_rate, half_axle)
