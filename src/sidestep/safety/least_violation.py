@@ -1,0 +1,161 @@
+"""By how much rows must give way when no action keeps them all: exact levels in the unit disc or circle.
+
+Rows are n_i.u >= c_i with unit normals, actions u are measured in units of the speed limit, and the
+violation of a row is v_i(u) = c_i - n_i.u. A *level* is the smallest largest violation some action can
+reach. Rows before `first` are kept as they are; the level is that of the rows from `first` on.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sidestep._arrays import Scalar
+
+
+class Rows(NamedTuple):
+    """Rows n.u >= c with unit normals n = (x, y); a row with n = 0 stands for no row at all."""
+
+    x: Float[Array, "*k"]
+    y: Float[Array, "*k"]
+    c: Float[Array, "*k"]
+
+
+def root(value: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """sqrt(max(value, 0)) whose gradient at and below 0 is 0 rather than infinite or NaN."""
+    positive = value > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
+
+
+def part(rows: Rows, start: int, stop: int | None = None) -> Rows:
+    """Rows `start` to `stop`."""
+    return Rows(rows.x[start:stop], rows.y[start:stop], rows.c[start:stop])
+
+
+def relax(rows: Rows, first: int, circle: bool) -> tuple[Rows, Scalar]:
+    """Lower the offsets of the rows from `first` on by their level, so that they can just hold.
+
+    Offsets far above 1 are moved down together first (which moves the level, not the best action), so
+    that huge offsets cost no digits.
+
+    **Returns** the relaxed rows and by how much each gave way, in units of the speed limit, 0 if all can
+    hold. The amount is capped to a few units where offsets are huge.
+    """
+    rows = _within_reach(rows, first)
+    if circle:
+        level = _circle_level(rows, first)
+    else:
+        level = _disc_level(rows, first)
+    level = jnp.maximum(level, 0.0)
+    c = jnp.concatenate([rows.c[:first], rows.c[first:] - level])
+    return Rows(rows.x, rows.y, c), level
+
+
+def _within_reach(rows: Rows, first: int) -> Rows:
+    """Offsets in [-2, 2]: below -1 a row always holds, above 1 only the differences to the largest matter."""
+    live = rows.x**2 + rows.y**2 > 0.0
+    c = jnp.where(live, rows.c, -2.0)
+    top = jnp.max(c[first:])
+    moved = jnp.where(top > 2.0, (c[first:] - top) + 2.0, c[first:])
+    return Rows(rows.x, rows.y, jnp.maximum(jnp.concatenate([c[:first], moved]), -2.0))
+
+
+def _disc_level(rows: Rows, first: int) -> Scalar:
+    """Level in the unit disc.
+
+    Helly's theorem in the plane: convex sets have a common point as soon as every three of them do. So
+    the level is the largest over all triples among the disc and the rows, and each triple has a closed
+    form: disc and two rows (`_free_pair`, `_kept_pair`), or three rows (`_triple`).
+    """
+    free, kept = part(rows, first), part(rows, 0, first)
+    level = jnp.max(free.c) - 1.0
+    if free.c.shape[0] > 1:
+        level = jnp.maximum(level, jnp.max(_free_pair(_column(free), free)))
+    if first > 0:
+        level = jnp.maximum(level, jnp.max(_kept_pair(_column(kept), free)))
+    if rows.c.shape[0] > 2:
+        level = jnp.maximum(level, jnp.max(_triple(rows, first)))
+    return level
+
+
+def _column(rows: Rows) -> Rows:
+    return Rows(rows.x[:, None], rows.y[:, None], rows.c[:, None])
+
+
+def _free_pair(p: Rows, q: Rows) -> Float[Array, "..."]:
+    """min over the disc of max(v_p, v_q), where that is not the level of a single row (then -inf).
+
+    With d = n_p - n_q and m = n_p + n_q (at right angles) the best action has v_p = v_q and lies on the
+    circle towards m: level = (c_p + c_q)/2 - |m|/2 sqrt(1 - (c_p - c_q)^2/|d|^2).
+    """
+    squared = (p.x - q.x) ** 2 + (p.y - q.y) ** 2
+    across = (p.x + q.x) ** 2 + (p.y + q.y) ** 2
+    gap = jnp.abs(p.c - q.c)
+    both = gap < squared / 2.0
+    share = gap**2 / jnp.where(both, squared, 1.0)
+    return jnp.where(both, (p.c + q.c - root(across * (1.0 - share))) / 2.0, -jnp.inf)
+
+
+def _kept_pair(kept: Rows, free: Rows) -> Float[Array, "..."]:
+    """min of v_free over the part of the disc where `kept` holds, if it is not c - 1 (then -inf).
+
+    The most favourable action n_free violates `kept`; the best one left is where the line of `kept`
+    meets the circle.
+    """
+    along = kept.x * free.x + kept.y * free.y
+    aside = jnp.abs(kept.x * free.y - kept.y * free.x)
+    best = kept.c * along + aside * root(1.0 - kept.c**2)
+    return jnp.where(along < kept.c, free.c - best, -jnp.inf)
+
+
+def _triple(rows: Rows, first: int) -> Float[Array, "k k k"]:
+    """Level of three rows without the disc, by linear duality; -inf where it is unbounded.
+
+    With multipliers l >= 0 such that sum l_i n_i = 0 (the cross products of the other two normals) the
+    level is sum l_i c_i / (sum of l_i over the free rows). Rounding is subtracted, so that rows which
+    can hold are never said not to.
+    """
+    n = rows.c.shape[0]
+    eps = float(jnp.finfo(rows.c.dtype).eps)
+    cross = rows.x[:, None] * rows.y[None, :] - rows.y[:, None] * rows.x[None, :]
+    one, two, three = cross[None, :, :], cross.T[:, None, :], cross[:, :, None]
+    free = (np.arange(n) >= first).astype(rows.c.dtype)
+    weight = one * free[:, None, None] + two * free[None, :, None] + three * free[None, None, :]
+    total = one * rows.c[:, None, None] + two * rows.c[None, :, None] + three * rows.c[None, None, :]
+    # An odd order of the three turns all signs, so the other orientation needs no case of its own.
+    inside = (one > 0.0) & (two > 0.0) & (three > 0.0) & (weight > 64.0 * eps)
+    safe = jnp.where(inside, weight, 1.0)
+    return jnp.where(inside, jnp.minimum(total / safe, 4.0) - 32.0 * eps / safe, -jnp.inf)
+
+
+def _circle_level(rows: Rows, first: int) -> Scalar:
+    """Level on the unit circle: the best of the actions where the largest violation can be least.
+
+    On the circle v_i is a sinusoid, so the least of their maximum lies at the bottom n_i of one, where
+    two cross, or at an end of an arc allowed by the rows that are kept. All are tried.
+    """
+    free, kept = part(rows, first), part(rows, 0, first)
+    eps = float(jnp.finfo(rows.c.dtype).eps)
+    p = _column(free)
+    dx, dy, gap = p.x - free.x, p.y - free.y, p.c - free.c
+    squared = dx**2 + dy**2
+    meet = (gap**2 <= squared) & (squared > 0.0)
+    safe = jnp.where(meet, squared, 1.0)
+    foot, rise = gap / safe, root(1.0 - gap**2 / safe) / jnp.sqrt(safe)
+    # Swapping the two rows gives the other of the two crossings.
+    crossings = (
+        jnp.where(meet, foot * dx - rise * dy, p.x).reshape(-1),
+        jnp.where(meet, foot * dy + rise * dx, p.y).reshape(-1),
+    )
+    half = root(1.0 - kept.c**2)
+    x = jnp.concatenate([free.x, crossings[0], kept.c * kept.x - half * kept.y, kept.c * kept.x + half * kept.y])
+    y = jnp.concatenate([free.y, crossings[1], kept.c * kept.y + half * kept.x, kept.c * kept.y - half * kept.x])
+    on_circle = jnp.abs(x**2 + y**2 - 1.0) <= 64.0 * eps
+    violation = rows.c - x[:, None] * rows.x - y[:, None] * rows.y
+    excess = jnp.maximum(jnp.max(violation[:, :first], axis=1, initial=-jnp.inf), 0.0)
+    level = jnp.max(violation[:, first:], axis=1)
+    key = jnp.where(on_circle, jnp.where(excess <= 64.0 * eps, level, 8.0 + excess), jnp.inf)
+    best = jnp.arange(key.shape[0]) == jnp.argmin(key)
+    # With no action on the circle (every row void) nothing can be violated.
+    return jnp.where(jnp.any(on_circle), jnp.sum(jnp.where(best, level, 0.0)), 0.0)
