@@ -24,3 +24,10 @@ def real(value: object) -> Float[Array, "..."]:
     gain then never recompiles.
     """
     return jnp.asarray(value, dtype=float)
+
+
+def norm(vectors: Float[AnyArray, "*batch n"]) -> Float[Array, "*batch"]:
+    """Euclidean length along the last axis, with gradient 0 (not NaN) where the length is 0."""
+    squared = jnp.sum(vectors**2, axis=-1)
+    long = squared > 0.0
+    return jnp.where(long, jnp.sqrt(jnp.where(long, squared, 1.0)), 0.0)

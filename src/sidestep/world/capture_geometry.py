@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Scalar
+from sidestep._arrays import AnyArray, Scalar, norm
 
 
 def to_pursuer_frame(point: Float[AnyArray, "2"], pose: Float[AnyArray, "3"]) -> Float[Array, "2"]:
@@ -30,8 +30,6 @@ def capture_set_distance(
     h = |x| cos S + |y| sin S - l.
     """
     ahead, aside = jnp.abs(z[0]), jnp.abs(z[1])
-    squared = ahead**2 + aside**2
-    distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     cosine, sine = jnp.cos(usable), jnp.sin(usable)
     in_front = aside * cosine < ahead * sine
-    return jnp.where(in_front, ahead * cosine + aside * sine, distance) - capture_distance
+    return jnp.where(in_front, ahead * cosine + aside * sine, norm(z)) - capture_distance

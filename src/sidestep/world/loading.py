@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sidestep._arrays import real
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
 from sidestep.world.scenario import Scenario
 
@@ -68,12 +69,16 @@ def _check_fields(values: Mapping[str, Any]) -> None:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else "."
-            raise ScenarioError(f"unknown scenario field '{name}'{hint} Known fields: {', '.join(sorted(known))}.")
+            raise ScenarioError(
+                f"unknown scenario field '{name}'{hint} Known fields: {', '.join(sorted(known))}."
+            )
 
 
 def _check_number(name: str, value: Any, test: Callable[[float], bool], allowed: str) -> None:
     try:
-        number = float(value)
+        # In the precision that will be used: 1e-60 is 0 in float32, 1e60 infinite.
+        with np.errstate(over="ignore"):
+            number = float(np.asarray(float(value), dtype=real(0.0).dtype))
     except (TypeError, ValueError):
         return _fail(name, value, f"a number is needed, {allowed}")
     if isinstance(value, bool) or not math.isfinite(number) or not test(number):
@@ -101,7 +106,9 @@ def _check_values(values: Mapping[str, Any]) -> None:
                 array = np.asarray(np.nan)
             if name == "obstacle_starts" and array.size == 0:
                 array = array.reshape(0, 2)
-            fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+            fits = array.ndim == len(shape) and all(
+                n in (None, m) for n, m in zip(shape, array.shape, strict=True)
+            )
             if not fits or not np.all(np.isfinite(array)):
                 wanted = " x ".join("n" if n is None else str(n) for n in shape)
                 _fail(name, value, f"it must be {wanted} finite numbers")
@@ -121,25 +128,31 @@ def _check_scene(scenario: Scenario) -> None:
                         _fail(
                             name,
                             point.tolist(),
-                            f"it lies {gap:.4g} m from the obstacle at {obstacle.tolist()}, inside the collision "
-                            f"distance {float(scenario.collision_distance):.4g} m; move one of them",
+                            f"it lies {gap:.4g} m from the obstacle at {obstacle.tolist()}, inside the "
+                            f"collision distance {float(scenario.collision_distance):.4g} m; move one",
                         )
     if scenario.pursuer_starts is not None and evader is not None:
         for pose in scenario.pursuer_starts:
             h = float(
-                capture_set_distance(to_pursuer_frame(evader, pose), scenario.usable_angle, scenario.capture_distance)
+                capture_set_distance(
+                    to_pursuer_frame(evader, pose), scenario.usable_angle, scenario.capture_distance
+                )
             )
             if h <= 0.0:
                 _fail(
                     "evader_start",
                     evader.tolist(),
-                    f"already captured by the pursuer at {pose.tolist()}: it starts {-h:.4g} m inside the capture "
-                    "set, where the pursuer wins at once; start farther away",
+                    f"already captured by the pursuer at {pose.tolist()}: it starts {-h:.4g} m inside the "
+                    "capture set, where the pursuer wins at once; start farther away",
                 )
     if evader is not None and target is not None:
         gap = float(jnp.linalg.norm(evader - target))
         if gap <= float(scenario.reach_distance):
-            _fail("target_start", target.tolist(), f"the evader starts {gap:.4g} m away, so it is reached already")
+            _fail(
+                "target_start",
+                target.tolist(),
+                f"the evader starts {gap:.4g} m away, so it is reached already",
+            )
 
 
 def _build(values: dict[str, Any]) -> Scenario:
@@ -148,9 +161,9 @@ def _build(values: dict[str, Any]) -> Scenario:
     values = dict(values)
     for name in _SHAPES:
         if values.get(name) is not None:
-            shape = _SHAPES[name]
             array = np.asarray(values[name], dtype=float)
-            values[name] = jnp.asarray(array.reshape(0, shape[1]) if array.size == 0 else array, dtype=float)
+            # Only `obstacle_starts` may be empty.
+            values[name] = jnp.asarray(array if array.size else array.reshape(0, 2), dtype=float)
     for starts, count in (("pursuer_starts", "pursuer_count"), ("obstacle_starts", "obstacle_count")):
         if values.get(starts) is None:
             continue
@@ -171,7 +184,8 @@ def _build(values: dict[str, Any]) -> Scenario:
             f"{float(scenario.initial_separation):.4g} m, 'obstacle_separation' = "
             f"{float(scenario.obstacle_separation):.4g} m, 'target_separation' = "
             f"{float(scenario.target_separation):.4g} m and {scenario.obstacle_count} obstacles of "
-            f"'collision_distance' = {float(scenario.collision_distance):.4g} m; enlarge it or lower one of them"
+            f"'collision_distance' = {float(scenario.collision_distance):.4g} m; enlarge it or lower one "
+            "of them"
         )
     return scenario
 
@@ -206,10 +220,14 @@ def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
             content = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
         except (UnicodeDecodeError, json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
             raise ScenarioError(f"scenario file {path} cannot be read: {error}") from None
+        if not isinstance(content, dict):
+            raise ScenarioError(
+                f"scenario file {path} must hold fields and their values, not a {type(content).__name__}"
+            )
         if isinstance(content.get("scenario"), dict):
             content = content["scenario"]
         preset = content.pop("preset", "paper")
-        if preset not in PRESETS:
+        if preset not in list(PRESETS):
             _fail("preset", preset, f"it must be one of {', '.join(PRESETS)}")
         values = {"name": path.stem, **PRESETS[preset], **content}
     return _build({**values, **overrides})

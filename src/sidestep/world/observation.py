@@ -18,7 +18,7 @@ with an action in [-1, 1]^2 in the same axes; the velocity is v_e times the acti
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, real
+from sidestep._arrays import AnyArray, norm, real
 from sidestep.world.robots import limit_speed
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -44,7 +44,9 @@ def observation_names(scenario: Scenario) -> list[str]:
     return names
 
 
-def frame_axes(scenario: Scenario, evader: Float[AnyArray, "2"], target: Float[AnyArray, "2"]) -> Float[Array, "2 2"]:
+def frame_axes(
+    scenario: Scenario, evader: Float[AnyArray, "2"], target: Float[AnyArray, "2"]
+) -> Float[Array, "2 2"]:
     """Rows are the unit axes of the policy's frame in world coordinates; the world's own at the target."""
     dtype = real(0.0).dtype
     if scenario.frame == "world":
@@ -60,29 +62,26 @@ def frame_axes(scenario: Scenario, evader: Float[AnyArray, "2"], target: Float[A
     return jnp.stack([ahead, jnp.stack([-ahead[1], ahead[0]])])
 
 
-def _norms(vectors: Float[Array, "n 2"]) -> Float[Array, "n"]:
-    squared = jnp.sum(vectors**2, axis=-1)
-    return jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
-
-
 def observe(scenario: Scenario, world: World) -> Float[Array, "observation"]:
     """The observation of one world; see the table at the top of this module.
 
     **Returns** `(observation_size(scenario),)`. `jax.vmap` it over worlds.
     """
     axes = frame_axes(scenario, world.evader, world.target)
-    distance = _norms((world.target - world.evader)[None])[0]
+    distance = norm(world.target - world.evader)
     parts = [jnp.stack([jnp.tanh(distance / 2.0), jnp.exp(-distance / _NEAR_TARGET)])]
     if scenario.frame == "world":
         parts.append(
-            jnp.where(distance > 0.0, (world.target - world.evader) / jnp.where(distance > 0.0, distance, 1.0), 0.0)
+            jnp.where(
+                distance > 0.0, (world.target - world.evader) / jnp.where(distance > 0.0, distance, 1.0), 0.0
+            )
         )
 
     def block(
         places: Float[Array, "n 2"], extra: Float[Array, "n 2"], contact: Float[Array, ""]
     ) -> Float[Array, "entries"]:
         offsets = places - world.evader
-        distances = _norms(offsets)
+        distances = norm(offsets)
         squashed = (offsets / (1.0 + distances[:, None])) @ axes.T
         near = jnp.exp(-jnp.maximum(distances - contact, 0.0) / _NEAR_ROBOT)
         entries = jnp.concatenate([squashed, extra @ axes.T, near[:, None]], axis=-1)
@@ -118,5 +117,5 @@ def goal_seeking(observation: Float[AnyArray, "observation"]) -> Float[Array, "2
 
 
 def goal_seeking_world(observation: Float[AnyArray, "observation"]) -> Float[Array, "2"]:
-    """`goal_seeking` for scenarios with `frame="world"`: reads the target's direction from entries 2 and 3."""
+    """`goal_seeking` for scenarios with `frame="world"`: the target's direction is entries 2 and 3."""
     return real(observation)[2:4]

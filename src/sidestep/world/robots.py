@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Scalar, real
+from sidestep._arrays import AnyArray, Scalar, norm, real
 
 _CHORDS = 4
 _NEWTON_STEPS = 2
@@ -16,14 +16,17 @@ def limit_speed(velocity: Float[AnyArray, "2"], speed_limit: Float[AnyArray, ""]
     The physics never lets a command exceed what the robot can do, and never lets a NaN into the
     state, where every later comparison with it would silently be false.
     """
-    velocity = jnp.where(jnp.all(jnp.isfinite(velocity)), velocity, 0.0)
+    # Clipped far above any speed, or else the square of a huge command overflows.
+    velocity = jnp.clip(jnp.where(jnp.all(jnp.isfinite(velocity)), velocity, 0.0), -1e15, 1e15)
     squared = jnp.sum(velocity**2)
     too_fast = squared > speed_limit**2
-    norm = jnp.sqrt(jnp.where(too_fast, squared, 1.0))
-    return jnp.where(too_fast, velocity * (speed_limit / norm), velocity)
+    length = jnp.sqrt(jnp.where(too_fast, squared, 1.0))
+    return jnp.where(too_fast, velocity * (speed_limit / length), velocity)
 
 
-def limit_wheels(wheel_speeds: Float[AnyArray, "... 2"], rim_speed: Float[AnyArray, ""]) -> Float[Array, "... 2"]:
+def limit_wheels(
+    wheel_speeds: Float[AnyArray, "... 2"], rim_speed: Float[AnyArray, ""]
+) -> Float[Array, "... 2"]:
     """Clip wheel rim speeds (m/s) to [-V, V], which is |v| + b|omega| <= V; non-finite ones become 0."""
     finite = jnp.where(jnp.isfinite(wheel_speeds), wheel_speeds, 0.0)
     return jnp.clip(finite, -rim_speed, rim_speed)
@@ -31,7 +34,7 @@ def limit_wheels(wheel_speeds: Float[AnyArray, "... 2"], rim_speed: Float[AnyArr
 
 def wrap_angle(angle: Float[AnyArray, "..."]) -> Float[Array, "..."]:
     """The same angle (rad) in [-pi, pi)."""
-    return (angle + jnp.pi) % (2.0 * jnp.pi) - jnp.pi
+    return jnp.mod(angle + jnp.pi, 2.0 * jnp.pi) - jnp.pi
 
 
 def body_velocity(
@@ -85,11 +88,7 @@ def glide(
     position: Float[AnyArray, "2"], velocity: Float[AnyArray, "2"], duration: Float[AnyArray, ""]
 ) -> Float[Array, "2"]:
     """Omnidirectional robot or drifting obstacle: straight motion at constant velocity."""
-    return position + velocity * duration
-
-
-def _norm(vector: Float[AnyArray, "2"]) -> Scalar:
-    return jnp.sqrt(jnp.sum(vector**2))
+    return jnp.asarray(position) + velocity * duration
 
 
 def closest_approach_straight(
@@ -102,7 +101,7 @@ def closest_approach_straight(
     still = squared_speed == 0.0
     when = -jnp.sum(relative_position * relative_velocity) / jnp.where(still, 1.0, squared_speed)
     when = jnp.clip(jnp.where(still, 0.0, when), 0.0, duration)
-    return _norm(relative_position + relative_velocity * when)
+    return norm(relative_position + relative_velocity * when)
 
 
 def closest_approach_driving(
@@ -120,7 +119,7 @@ def closest_approach_driving(
     below the true minimum and above it by second order in a time error that is itself tiny.
     """
     speed, turn_rate = body_velocity(wheel_speeds, half_axle)
-    start = position - pose[:2]
+    start = jnp.asarray(position) - pose[:2]
 
     def separation(when: Scalar) -> Float[Array, "2"]:
         half_turn = turn_rate * when / 2.0
@@ -146,5 +145,5 @@ def closest_approach_driving(
         slope = jnp.sum(rate**2) + jnp.sum(q * bend)
         update = when - jnp.sum(q * rate) / jnp.where(slope > 0.0, slope, 1.0)
         when = jnp.where(slope > 0.0, jnp.clip(update, low, low + step), when)
-    ends = jnp.sqrt(jnp.minimum(jnp.sum(path[0] ** 2), jnp.sum(path[-1] ** 2)))
-    return jnp.minimum(_norm(separation(when)), ends)
+    ends = jnp.minimum(norm(path[0]), norm(path[-1]))
+    return jnp.minimum(norm(separation(when)), ends)

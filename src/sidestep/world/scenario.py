@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep._arrays import AnyArray, Flag, Scalar, norm, real
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
 from sidestep.world.robots import (
@@ -115,14 +115,13 @@ class Scenario(eqx.Module):
         The separations of the random distribution bind only what is drawn, never a start that the user
         fixed.
         """
-        distance = lambda points, point: jnp.sqrt(jnp.sum((points - point) ** 2, axis=-1))  # noqa: E731
         in_frame = jax.vmap(to_pursuer_frame, in_axes=(None, 0))(world.evader, world.pursuers)
         escape = jax.vmap(capture_set_distance, in_axes=(0, None, None))(
             in_frame, self.usable_angle, self.capture_distance
         )
-        evader_to_obstacle = distance(world.obstacles[:, :2], world.evader)
-        target_to_obstacle = distance(world.obstacles[:, :2], world.target)
-        target_to_evader = distance(world.target, world.evader)
+        evader_to_obstacle = norm(world.obstacles[:, :2] - world.evader)
+        target_to_obstacle = norm(world.obstacles[:, :2] - world.target)
+        target_to_evader = norm(world.target - world.evader)
         good = (
             jnp.all(escape > 0.0)
             & jnp.all(evader_to_obstacle > self.collision_distance)
@@ -131,7 +130,7 @@ class Scenario(eqx.Module):
         )
         evader_drawn = self.evader_start is None
         if evader_drawn or self.pursuer_starts is None:
-            good &= jnp.all(distance(world.pursuers[:, :2], world.evader) >= self.initial_separation)
+            good &= jnp.all(norm(world.pursuers[:, :2] - world.evader) >= self.initial_separation)
         if evader_drawn or self.obstacle_starts is None:
             good &= jnp.all(evader_to_obstacle >= self.obstacle_separation)
         if evader_drawn or self.target_start is None:
@@ -181,9 +180,7 @@ class Scenario(eqx.Module):
             )
 
         def pass_by(obstacle: Array) -> Scalar:
-            return closest_approach_straight(
-                world.evader - obstacle[:2], velocity - obstacle[2:], period
-            )
+            return closest_approach_straight(world.evader - obstacle[:2], velocity - obstacle[2:], period)
 
         to_pursuers = jax.vmap(approach)(world.pursuers, wheels)
         to_obstacles = jax.vmap(pass_by)(world.obstacles)
@@ -210,7 +207,7 @@ class Scenario(eqx.Module):
         collided = obstacle_clearance <= 0.0
         reached = (to_target <= self.reach_distance) & ~captured & ~collided
         timed_out = (periods >= self.episode_steps) & ~captured & ~collided & ~reached
-        distance = jnp.sqrt(jnp.sum((moved.evader - moved.target) ** 2))
+        distance = norm(moved.evader - moved.target)
         return moved, Events(
             reward=jnp.where(reached, self.reach_reward, -self.distance_cost * distance),
             captured=captured,
@@ -230,9 +227,10 @@ class Scenario(eqx.Module):
         limited = limit_speed(velocity, self.evader_speed)
         if self.action == "velocity":
             return limited
-        norm = jnp.sqrt(jnp.sum(limited**2))
-        moving = norm > 0.0
-        direction = jnp.where(
-            moving, limited / jnp.where(moving, norm, 1.0), jnp.array([1.0, 0.0], limited.dtype)
+        # Scaled before it is squared, or else a tiny command underflows and loses its direction.
+        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(limited)))
+        moving = largest > 0.0
+        scaled = jnp.where(
+            moving, limited / jnp.where(moving, largest, 1.0), jnp.array([1.0, 0.0], limited.dtype)
         )
-        return self.evader_speed * direction
+        return self.evader_speed * (scaled / norm(scaled))

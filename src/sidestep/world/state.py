@@ -42,7 +42,9 @@ class World(eqx.Module):
         self.obstacles = real(obstacles)
         self.target = real(target)
         self.time = real(time)
-        self.evader_velocity = jnp.zeros_like(self.evader) if evader_velocity is None else real(evader_velocity)
+        self.evader_velocity = (
+            jnp.zeros_like(self.evader) if evader_velocity is None else real(evader_velocity)
+        )
         self.wheel_speeds = (
             jnp.zeros((self.pursuers.shape[0], 2), self.pursuers.dtype)
             if wheel_speeds is None
