@@ -1,0 +1,202 @@
+"""Replay of whole world transitions, from which batches are made for any target and either action."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from sidestep._arrays import Flag, Scalar, real
+from sidestep.learning.td3 import Batch
+from sidestep.world import Scenario, World, observe, to_action
+from sidestep.world.robots import closest_approach_straight, limit_speed
+
+
+class Transition(eqx.Module):
+    """One decision of the policy: the world before and after, and everything that happened between.
+
+    Nothing in it depends on the target, which moves nothing; so the same transition can be read with
+    any other target (hindsight, Andrychowicz et al., NeurIPS 2017) and its reward recomputed exactly.
+
+    **Attributes:** `path (n+1, 2)` the evader at every control instant of the decision (m; the last place
+    repeated once the episode has ended); `steps` control periods executed; `proposed (2,)` the velocity
+    the policy asked for and `executed (2,)` the mean velocity driven (m/s, world axes); `correction`
+    mean size of the shield's correction (m/s); `lost` whether capture or collision ended it.
+    """
+
+    world: World
+    next_world: World
+    path: Float[Array, "knots 2"]
+    steps: Int[Array, ""]
+    proposed: Float[Array, "2"]
+    executed: Float[Array, "2"]
+    correction: Scalar
+    lost: Flag
+
+
+class Replay(eqx.Module):
+    """Ring of transitions. `written` counts all ever added; slot = count modulo capacity.
+
+    `episode` says which episode a slot belongs to, `episode_last[e mod len]` the count of that
+    episode's newest transition, so that a later place of the same episode is one look-up away.
+    """
+
+    transitions: Transition
+    episode: Int[Array, "capacity"]
+    episode_last: Int[Array, "episodes"]
+    written: Int[Array, ""]
+
+    @property
+    def capacity(self) -> int:
+        return self.episode.shape[0]
+
+    @property
+    def size(self) -> Int[Array, ""]:
+        """Number of transitions that can be sampled."""
+        return jnp.minimum(self.written, self.capacity)
+
+    @classmethod
+    def init(cls, example: Transition, capacity: int) -> Replay:
+        """An empty ring for transitions shaped like `example`."""
+        return cls(
+            transitions=jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example),
+            episode=jnp.full((capacity,), -1),
+            episode_last=jnp.zeros((capacity,), int),
+            written=jnp.asarray(0),
+        )
+
+    def add(self, transition: Transition, episode: Int[Array, ""], active: Flag) -> Replay:
+        """The ring with one more transition of episode number `episode`; unchanged unless `active`.
+
+        The write is unconditional and merely lands out of bounds when inactive: a conditional would copy
+        the whole ring under `vmap`.
+        """
+        slot = jnp.where(active, self.written % self.capacity, self.capacity)
+        last_slot = jnp.where(active, episode % self.capacity, self.capacity)
+        return Replay(
+            transitions=jax.tree.map(
+                lambda ring, leaf: ring.at[slot].set(leaf, mode="drop"), self.transitions, transition
+            ),
+            episode=self.episode.at[slot].set(episode, mode="drop"),
+            episode_last=self.episode_last.at[last_slot].set(self.written, mode="drop"),
+            written=self.written + active.astype(self.written.dtype),
+        )
+
+
+def reward_along(
+    scenario: Scenario, transition: Transition, target: Float[Array, "2"]
+) -> tuple[Scalar, Bool[Array, ""]]:
+    """Sum of the paper's reward over a decision for any target, and whether the episode ends in it.
+
+    The evader moves straight between control instants, so the swept distance to the target is exact.
+    Returns (reward, terminated); lost episodes end without the bonus in their last period.
+    """
+    knots = transition.path
+    count = knots.shape[0] - 1
+    index = jnp.arange(count)
+    ran = index < transition.steps
+    nearest = jax.vmap(closest_approach_straight, in_axes=(0, 0, None))(
+        knots[:-1] - target, knots[1:] - knots[:-1], real(1.0)
+    )
+    is_last_of_lost = transition.lost & (index == transition.steps - 1)
+    touches = ran & (nearest <= scenario.reach_distance) & ~is_last_of_lost
+    reached = jnp.any(touches)
+    first = jnp.where(reached, jnp.argmax(touches), count)
+    offset = knots[1:] - target
+    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
+    cost = -scenario.distance_cost * jnp.sum(jnp.where(ran & (index < first), distance, 0.0))
+    return cost + jnp.where(reached, scenario.reach_reward, 0.0), reached | transition.lost
+
+
+def _reflect(vectors: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    return vectors * jnp.array([1.0, -1.0], vectors.dtype)
+
+
+def mirror_world(world: World) -> World:
+    """The world reflected in its x axis: left and right swap, headings change sign.
+
+    The robots do not tell left from right, so a transition's mirror image is as true as itself.
+    """
+    obstacles = world.obstacles * jnp.array([1.0, -1.0, 1.0, -1.0], world.obstacles.dtype)
+    return World(
+        evader=_reflect(world.evader),
+        pursuers=world.pursuers * jnp.array([1.0, -1.0, -1.0], world.pursuers.dtype),
+        obstacles=obstacles,
+        target=_reflect(world.target),
+        time=world.time,
+        evader_velocity=_reflect(world.evader_velocity),
+        wheel_speeds=world.wheel_speeds[..., ::-1],
+    )
+
+
+def sample(
+    scenario: Scenario,
+    replay: Replay,
+    key: PRNGKeyArray,
+    batch_size: int,
+    *,
+    hindsight: Float[Array, ""],
+    mirror: Float[Array, ""],
+    executed_action: bool,
+    correction_penalty: Float[Array, ""],
+    reward_scale: Float[Array, ""],
+) -> tuple[Batch, World]:
+    """A batch of uniform transitions, a share `hindsight` of them with a place reached later as target.
+
+    The later place is uniform over the rest of the same episode (the "future" strategy). The action is
+    the proposed or the executed velocity in the policy's axes *for that target*; the reward is scaled by
+    `reward_scale` after `correction_penalty` times the mean correction (as a share of v_e) is taken off.
+
+    **Returns** the batch and the worlds after it, whose targets are the sampled ones.
+    """
+    index_key, later_key, choice_key, knot_key, mirror_key = jax.random.split(key, 5)
+    # Slots count back from the newest, so that sampling is uniform over what the ring still holds.
+    back = jax.random.randint(index_key, (batch_size,), 1, replay.size + 1)
+    count = replay.written - back
+    slot = count % replay.capacity
+    picked = jax.tree.map(lambda leaf: leaf[slot], replay.transitions)
+
+    last = replay.episode_last[replay.episode[slot] % replay.capacity]
+    span = (last - count + 1).astype(reward_scale.dtype)
+    ahead = jnp.floor(jax.random.uniform(later_key, (batch_size,), dtype=float) * span).astype(count.dtype)
+    later = (jnp.minimum(count + ahead, last)) % replay.capacity
+    # Any control instant of the later decision will do; the last one is always valid.
+    knots = replay.transitions.path[later]
+    places = jnp.take_along_axis(
+        knots,
+        jax.random.randint(knot_key, (batch_size,), 1, replay.transitions.steps[later] + 1)[:, None, None],
+        axis=1,
+    )[:, 0]
+    relabel = jax.random.uniform(choice_key, (batch_size,), dtype=float) < hindsight
+    target = jnp.where(relabel[:, None], places, picked.world.target)
+
+    def with_target(world: World) -> World:
+        return eqx.tree_at(lambda w: w.target, world, target)
+
+    reward, terminated = jax.vmap(reward_along, in_axes=(None, 0, 0))(scenario, picked, target)
+    flip = jax.random.uniform(mirror_key, (batch_size,), dtype=float) < mirror
+    velocity = picked.executed if executed_action else picked.proposed
+    velocity = jnp.where(flip[:, None], _reflect(velocity), velocity)
+    world, next_world = (
+        jax.tree.map(
+            lambda mirrored, seen: jnp.where(jnp.expand_dims(flip, range(1, seen.ndim)), mirrored, seen),
+            mirror_world(world),
+            world,
+        )
+        for world in (with_target(picked.world), with_target(picked.next_world))
+    )
+    penalty = correction_penalty * picked.correction / scenario.evader_speed
+    batch = Batch(
+        observation=jax.vmap(observe, in_axes=(None, 0))(scenario, world),
+        action=jax.vmap(to_action, in_axes=(None, 0, 0))(scenario, world, velocity),
+        reward=reward_scale * (reward - penalty),
+        next_observation=jax.vmap(observe, in_axes=(None, 0))(scenario, next_world),
+        terminated=terminated.astype(reward.dtype),
+    )
+    return batch, next_world
+
+
+def on_disc(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
+    """Actions as the robot executes them: norm cut to one (`to_velocity` does the same to the policy's)."""
+    return jax.vmap(limit_speed, in_axes=(0, None))(actions, real(1.0))

@@ -1,0 +1,170 @@
+"""TD3, exactly: Fujimoto, van Hoof, Meger, "Addressing Function Approximation Error in Actor-Critic
+Methods", ICML 2018, and the authors' code where the two differ.
+
+One `update` is one step of the algorithm on one batch; what fills the batch, and what an action means,
+is the training loop's business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sidestep._arrays import Scalar, real
+from sidestep.learning.networks import Actor, TwinCritic
+
+Bound = Callable[[Float[Array, "batch action"], PRNGKeyArray], Float[Array, "batch action"]]
+
+
+class TD3(eqx.Module):
+    """Hyper-parameters. Real values are traced, so seeds may be `vmap`-ped over learning rates.
+
+    Noises are in units of the action range [-1, 1]. `policy_delay` counts critic updates per update of
+    the actor and of both target networks.
+    """
+
+    actor_learning_rate: Scalar = eqx.field(converter=real, default=3e-4)
+    critic_learning_rate: Scalar = eqx.field(converter=real, default=3e-4)
+    discount: Scalar = eqx.field(converter=real, default=0.99)
+    target_rate: Scalar = eqx.field(converter=real, default=0.005)
+    target_noise: Scalar = eqx.field(converter=real, default=0.2)
+    target_noise_clip: Scalar = eqx.field(converter=real, default=0.5)
+    value_limit: Scalar = eqx.field(converter=real, default=jnp.inf)
+    policy_delay: int = eqx.field(static=True, default=2)
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
+    last_layer_scale: float = eqx.field(static=True, default=1.0)
+
+    def init(self, observations: int, actions: int, key: PRNGKeyArray) -> Learner:
+        """Fresh networks; targets start equal to them."""
+        actor_key, critic_key = jax.random.split(key)
+        actor = Actor(observations, actions, self.hidden, actor_key, self.last_layer_scale)
+        critic = TwinCritic(observations, actions, self.hidden, critic_key)
+        optimiser = optax.scale_by_adam()
+        return Learner(
+            actor=actor,
+            critic=critic,
+            target_actor=actor,
+            target_critic=critic,
+            actor_moments=optimiser.init(eqx.filter(actor, eqx.is_array)),
+            critic_moments=optimiser.init(eqx.filter(critic, eqx.is_array)),
+            updates=jnp.asarray(0),
+        )
+
+
+class Learner(eqx.Module):
+    """Everything that TD3 changes: networks, targets, Adam moments, count of updates."""
+
+    actor: Actor
+    critic: TwinCritic
+    target_actor: Actor
+    target_critic: TwinCritic
+    actor_moments: optax.OptState
+    critic_moments: optax.OptState
+    updates: Int[Array, ""]
+
+
+class Batch(eqx.Module):
+    """Transitions to learn from. `terminated` is 1 where the value beyond is zero; time limits are not."""
+
+    observation: Float[Array, "batch observation"]
+    action: Float[Array, "batch action"]
+    reward: Float[Array, "batch"]
+    next_observation: Float[Array, "batch observation"]
+    terminated: Float[Array, "batch"]
+
+
+class Losses(eqx.Module):
+    """Diagnostics of one update."""
+
+    critic: Scalar
+    actor: Scalar
+    value: Scalar
+
+
+def _no_bound(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
+    return actions
+
+
+def _adam(gradients, moments, network, rate: Scalar):
+    """One Adam step with a traced learning rate."""
+    directions, moments = optax.scale_by_adam().update(gradients, moments)
+    return jax.tree.map(lambda weight, direction: weight - rate * direction, network, directions), moments
+
+
+def update(
+    algorithm: TD3,
+    learner: Learner,
+    batch: Batch,
+    key: PRNGKeyArray,
+    bound: Bound = _no_bound,
+    target_bound: Bound | None = None,
+) -> tuple[Learner, Losses]:
+    """One TD3 update.
+
+    y = r + discount (1 - terminated) min_i Q_i'(s', a'),  a' = clip(pi'(s') + clip(noise)), and the critic
+    loss is the *sum* of the two mean squared errors. Every `policy_delay` updates the actor climbs Q1
+    and both target networks move.
+
+    `bound` maps actions onto those the robot can execute (a disc, say) before any critic judges them;
+    `target_bound` does so for the target action alone (the safety filter, when executed actions are
+    learned from) and is `bound` unless given.
+    """
+    noise_key, bound_key, actor_key = jax.random.split(key, 3)
+    target_bound = bound if target_bound is None else target_bound
+
+    noise = algorithm.target_noise * jax.random.normal(noise_key, batch.action.shape, dtype=float)
+    noise = jnp.clip(noise, -algorithm.target_noise_clip, algorithm.target_noise_clip)
+    smoothed = jnp.clip(learner.target_actor(batch.next_observation) + noise, -1.0, 1.0)
+    next_action = target_bound(smoothed, bound_key)
+    next_values = learner.target_critic(batch.next_observation, next_action)
+    wanted = batch.reward + algorithm.discount * (1.0 - batch.terminated) * jnp.minimum(*next_values)
+    wanted = jnp.minimum(wanted, algorithm.value_limit)
+
+    def critic_loss(critic: TwinCritic) -> tuple[Scalar, Scalar]:
+        first, second = critic(batch.observation, batch.action)
+        return jnp.mean((first - wanted) ** 2) + jnp.mean((second - wanted) ** 2), jnp.mean(first)
+
+    (critic_error, value), gradients = jax.value_and_grad(critic_loss, has_aux=True)(learner.critic)
+    critic, critic_moments = _adam(
+        gradients, learner.critic_moments, learner.critic, algorithm.critic_learning_rate
+    )
+
+    def delayed(learner: Learner) -> tuple[Learner, Scalar]:
+        def actor_loss(actor: Actor) -> Scalar:
+            actions = bound(actor(batch.observation), actor_key)
+            return -jnp.mean(critic.first_value(batch.observation, actions))
+
+        loss, gradients = jax.value_and_grad(actor_loss)(learner.actor)
+        actor, moments = _adam(gradients, learner.actor_moments, learner.actor, algorithm.actor_learning_rate)
+        rate = algorithm.target_rate
+
+        def follow(target, online):
+            return jax.tree.map(lambda old, new: (1.0 - rate) * old + rate * new, target, online)
+
+        moved = Learner(
+            actor=actor,
+            critic=critic,
+            target_actor=follow(learner.target_actor, actor),
+            target_critic=follow(learner.target_critic, critic),
+            actor_moments=moments,
+            critic_moments=critic_moments,
+            updates=learner.updates + 1,
+        )
+        return moved, loss
+
+    def not_yet(learner: Learner) -> tuple[Learner, Scalar]:
+        moved = eqx.tree_at(
+            lambda x: (x.critic, x.critic_moments, x.updates),
+            learner,
+            (critic, critic_moments, learner.updates + 1),
+        )
+        return moved, real(jnp.nan)
+
+    due = (learner.updates + 1) % algorithm.policy_delay == 0
+    learner, actor_error = jax.lax.cond(due, delayed, not_yet, learner)
+    return learner, Losses(critic=critic_error, actor=actor_error, value=value)

@@ -1,0 +1,286 @@
+"""The training loop: act, shield, move, store, update, all on the device under one `lax.scan`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from sidestep._arrays import Count, Flag, Scalar, real
+from sidestep.learning.control_step import control_step
+from sidestep.learning.options import TrainingOptions
+from sidestep.learning.replay import Replay, Transition, on_disc, sample
+from sidestep.learning.td3 import Learner, Losses, update
+from sidestep.world import Scenario, World, observation_size, observe, to_action, to_velocity
+
+CAPTURED, COLLIDED, REACHED, TIMED_OUT = range(4)
+OUTCOMES = ("captured", "collided", "reached", "timed_out")
+
+
+class Tally(eqx.Module):
+    """What one episode has come to so far. Clearances in m, correction in m/s summed over periods."""
+
+    total_reward: Scalar
+    steps: Count
+    pursuer_clearance: Scalar
+    obstacle_clearance: Scalar
+    interventions: Count
+    infeasible: Count
+    correction: Scalar
+
+    @classmethod
+    def init(cls) -> Tally:
+        zero, count, far = real(0.0), jnp.asarray(0), real(jnp.inf)
+        return cls(zero, count, far, far, count, count, zero)
+
+
+class TrainState(eqx.Module):
+    """Everything a training is: save it and the training goes on bit for bit."""
+
+    learner: Learner
+    replay: Replay
+    world: World
+    memory: Any
+    tally: Tally
+    key: PRNGKeyArray
+    episodes: Count
+    decisions: Count
+    env_steps: Count
+
+
+class Report(eqx.Module):
+    """What one decision reports to the host: the tally, which is an episode's when `ended`."""
+
+    ended: Bool[Array, "..."]
+    outcome: Int[Array, "..."]
+    tally: Tally
+    env_steps: Int[Array, "..."]
+    losses: Losses
+
+
+class _Drive(eqx.Module):
+    """Carry of the control periods within one decision."""
+
+    world: World
+    memory: Any
+    tally: Tally
+    alive: Flag
+    lost: Flag
+    outcome: Count
+    steps: Count
+    executed: Float[Array, "2"]
+    correction: Scalar
+
+
+def start(
+    scenario: Scenario, shield: Any, options: TrainingOptions, key: PRNGKeyArray, capacity: int
+) -> TrainState:
+    """The state before the first decision."""
+    net_key, reset_key, key = jax.random.split(key, 3)
+    world = scenario.reset(reset_key)
+    example = Transition(
+        world=world,
+        next_world=world,
+        path=jnp.zeros((options.decision_steps + 1, 2), world.evader.dtype),
+        steps=jnp.asarray(0),
+        proposed=jnp.zeros_like(world.evader),
+        executed=jnp.zeros_like(world.evader),
+        correction=real(0.0),
+        lost=jnp.asarray(False),
+    )
+    return TrainState(
+        learner=options.algorithm.init(observation_size(scenario), 2, net_key),
+        replay=Replay.init(example, capacity),
+        world=world,
+        memory=shield.init(world),
+        tally=Tally.init(),
+        key=key,
+        episodes=jnp.asarray(0),
+        decisions=jnp.asarray(0),
+        env_steps=jnp.asarray(0),
+    )
+
+
+def _drive(
+    scenario: Scenario,
+    shield: Any,
+    pursuer: Any,
+    options: TrainingOptions,
+    state: TrainState,
+    nominal: Float[Array, "2"],
+    key: PRNGKeyArray,
+) -> tuple[_Drive, Float[Array, "knots 2"]]:
+    """Hold the nominal velocity for a decision; nothing moves any more once the episode has ended."""
+
+    def period(carry: _Drive, key: PRNGKeyArray) -> tuple[_Drive, Float[Array, "2"]]:
+        world, memory, events, result, _ = control_step(
+            scenario, shield, pursuer, carry.world, carry.memory, nominal, key
+        )
+        tally = carry.tally
+        moved = _Drive(
+            world=world,
+            memory=memory,
+            tally=Tally(
+                total_reward=tally.total_reward + events.reward,
+                steps=tally.steps + 1,
+                pursuer_clearance=jnp.minimum(tally.pursuer_clearance, events.pursuer_clearance),
+                obstacle_clearance=jnp.minimum(tally.obstacle_clearance, events.obstacle_clearance),
+                interventions=tally.interventions + (result.status != 0).astype(tally.steps.dtype),
+                infeasible=tally.infeasible + (result.status >= 2).astype(tally.steps.dtype),
+                correction=tally.correction + result.intervention,
+            ),
+            alive=~(events.terminated | events.truncated),
+            lost=events.captured | events.collided,
+            outcome=jnp.where(
+                events.captured,
+                CAPTURED,
+                jnp.where(events.collided, COLLIDED, jnp.where(events.reached, REACHED, TIMED_OUT)),
+            ).astype(carry.outcome.dtype),
+            steps=carry.steps + 1,
+            executed=carry.executed + result.action,
+            correction=carry.correction + result.intervention,
+        )
+        carry = jax.tree.map(lambda new, old: jnp.where(carry.alive, new, old), moved, carry)
+        return carry, carry.world.evader
+
+    begin = _Drive(
+        world=state.world,
+        memory=state.memory,
+        tally=state.tally,
+        alive=jnp.asarray(True),
+        lost=jnp.asarray(False),
+        outcome=jnp.asarray(0),
+        steps=jnp.asarray(0),
+        executed=jnp.zeros_like(nominal),
+        correction=real(0.0),
+    )
+    end, places = jax.lax.scan(period, begin, jax.random.split(key, options.decision_steps))
+    return end, jnp.concatenate([state.world.evader[None], places])
+
+
+def _learn(
+    scenario: Scenario, shield: Any, options: TrainingOptions, learner: Learner, replay: Replay, key: PRNGKeyArray
+) -> tuple[Learner, Losses]:
+    def one(learner: Learner, key: PRNGKeyArray) -> tuple[Learner, Losses]:
+        sample_key, update_key = jax.random.split(key)
+        batch, next_world = sample(
+            scenario,
+            replay,
+            sample_key,
+            options.batch_size,
+            hindsight=options.hindsight,
+            mirror=options.mirror,
+            executed_action=options.replay_action == "executed",
+            correction_penalty=options.correction_penalty,
+            reward_scale=options.reward_scale,
+        )
+
+        def through_shield(actions: Array, key: PRNGKeyArray) -> Array:
+            def filtered(world: World, action: Array) -> Array:
+                result, _ = shield(world, to_velocity(scenario, world, action), shield.init(world))
+                return to_action(scenario, world, result.action)
+
+            return jax.vmap(filtered)(next_world, actions)
+
+        target_bound = through_shield if options.replay_action == "executed" else on_disc
+        return update(options.algorithm, learner, batch, update_key, on_disc, target_bound)
+
+    learner, losses = jax.lax.scan(one, learner, jax.random.split(key, options.updates_per_decision))
+    return learner, jax.tree.map(lambda loss: loss[-1], losses)
+
+
+def decide_and_learn(
+    scenario: Scenario, shield: Any, pursuer: Any, options: TrainingOptions, state: TrainState, limit: Count
+) -> tuple[TrainState, Report]:
+    """One decision of the policy, its control periods, and the updates that follow it.
+
+    Once `limit` episodes have ended nothing changes any more, so a training stops exactly at the end of
+    an episode wherever its chunks end.
+    """
+    active = state.episodes < limit
+    key, noise_key, random_key, drive_key, learn_key, reset_key = jax.random.split(state.key, 6)
+
+    wanted = state.learner.actor(observe(scenario, state.world)[None])[0]
+    noise = options.exploration_noise * jax.random.normal(noise_key, (2,), dtype=float)
+    explored = jnp.clip(wanted + noise, -1.0, 1.0)
+    anything = jax.random.uniform(random_key, (2,), dtype=float, minval=-1.0, maxval=1.0)
+    warm = state.decisions < options.warmup_decisions
+    nominal = to_velocity(scenario, state.world, jnp.where(warm, anything, explored))
+
+    end, path = _drive(scenario, shield, pursuer, options, state, nominal, drive_key)
+    periods = end.steps.astype(nominal.dtype)
+    replay = state.replay.add(
+        Transition(
+            world=state.world,
+            next_world=end.world,
+            path=path,
+            steps=end.steps,
+            proposed=nominal,
+            executed=end.executed / periods,
+            correction=end.correction / periods,
+            lost=end.lost,
+        ),
+        state.episodes,
+        active,
+    )
+    learner, losses = jax.lax.cond(
+        active & ~warm,
+        lambda learner: _learn(scenario, shield, options, learner, replay, learn_key),
+        lambda learner: (learner, Losses(real(0.0), real(0.0), real(0.0))),
+        state.learner,
+    )
+
+    ended = ~end.alive
+    fresh = scenario.reset(reset_key)
+    begun = (fresh, shield.init(fresh), Tally.init())
+    world, memory, tally = jax.tree.map(
+        lambda new, old: jnp.where(ended, new, old), begun, (end.world, end.memory, end.tally)
+    )
+    env_steps = state.env_steps + end.steps
+    moved = TrainState(
+        learner=learner,
+        replay=replay,
+        world=world,
+        memory=memory,
+        tally=tally,
+        key=key,
+        episodes=state.episodes + ended.astype(state.episodes.dtype),
+        decisions=state.decisions + 1,
+        env_steps=env_steps,
+    )
+    # Replay and learner were gated where they change; selecting the rest costs nothing.
+    heavy = lambda s: (s.learner, s.replay)  # noqa: E731
+    frozen = eqx.tree_at(heavy, state, (learner, replay))
+    state = eqx.tree_at(
+        heavy,
+        jax.tree.map(
+            lambda new, old: jnp.where(active, new, old),
+            eqx.tree_at(heavy, moved, (None, None)),
+            eqx.tree_at(heavy, frozen, (None, None)),
+        ),
+        (learner, replay),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    report = Report(ended=ended & active, outcome=end.outcome, tally=end.tally, env_steps=env_steps, losses=losses)
+    return state, report
+
+
+@eqx.filter_jit(donate="none")
+def run_chunk(
+    scenario: Scenario,
+    shield: Any,
+    pursuer: Any,
+    options: TrainingOptions,
+    state: TrainState,
+    limit: Int[Array, ""],
+    length: int,
+) -> tuple[TrainState, Report]:
+    """`length` decisions in one compiled loop; the report has a leading axis of `length`."""
+
+    def body(state: TrainState, _: None) -> tuple[TrainState, Report]:
+        return decide_and_learn(scenario, shield, pursuer, options, state, limit)
+
+    return jax.lax.scan(body, state, None, length=length)
