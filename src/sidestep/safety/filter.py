@@ -224,10 +224,12 @@ def _closest(
         candidate = jnp.abs(c) <= 1.0 + tolerance(c.dtype)
     else:
         low, minus_high = _worst(limits, (x, y, c), rows)
-        t = jnp.minimum(jnp.maximum(x * wish[1] - y * wish[0], jnp.maximum(low, -half)), jnp.minimum(-minus_high, half))
+        allowed = jnp.minimum(jnp.maximum(x * wish[1] - y * wish[0], low), -minus_high)
+        # The disc last: should the limits contradict each other, `violation` below will show it.
+        t = jnp.clip(allowed, -half, half)
         # Some row that the start violates is active at the answer, so the others need not be tried.
         candidate = short_of_start > 0.0
-    violation = _worst(miss, (x, y, c, t), rows)
+    violation = jnp.maximum(_worst(miss, (x, y, c, t), rows), jnp.abs(c) - 1.0)
     ahead = c - x * start[0] - y * start[1]
     aside = t - (x * start[1] - y * start[0])
     distance = ahead**2 + aside**2 + weight * (1.0 - c**2 - t**2)
