@@ -115,10 +115,14 @@ def project(
     # A robot that cannot move has one action: zero.
     infeasible = never | jnp.where(moving, infeasible, jnp.any(c > 0.0))
     stopped = jnp.all(nominal == 0.0)
-    kept = ~infeasible & (jnp.where(moving, unchanged & (answer.x == start[0]) & (answer.y == start[1]), stopped))
+    kept = ~infeasible & (
+        jnp.where(moving, unchanged & (answer.x == start[0]) & (answer.y == start[1]), stopped)
+    )
     action = jnp.where(kept, nominal, jnp.stack([answer.x, answer.y]) * limit)
     status = jnp.where(
-        valid, jnp.where(infeasible, Status.INFEASIBLE, jnp.where(kept, Status.OK, Status.CORRECTED)), Status.INVALID
+        valid,
+        jnp.where(infeasible, Status.INFEASIBLE, jnp.where(kept, Status.OK, Status.CORRECTED)),
+        Status.INVALID,
     ).astype(jnp.int32)
     slack = jnp.min(jnp.where(row_valid, x * action[0] + y * action[1] - c, jnp.inf), initial=jnp.inf)
     return Projection(action, status, slack)

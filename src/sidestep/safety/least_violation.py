@@ -43,10 +43,7 @@ def relax(rows: Rows, first: int, circle: bool) -> tuple[Rows, Scalar]:
     hold. The amount is capped to a few units where offsets are huge.
     """
     rows = _within_reach(rows, first)
-    if circle:
-        level = _circle_level(rows, first)
-    else:
-        level = _disc_level(rows, first)
+    level = _circle_level(rows, first) if circle else _disc_level(rows, first)
     level = jnp.maximum(level, 0.0)
     c = jnp.concatenate([rows.c[:first], rows.c[first:] - level])
     return Rows(rows.x, rows.y, c), level
@@ -149,8 +146,12 @@ def _circle_level(rows: Rows, first: int) -> Scalar:
         jnp.where(meet, foot * dy + rise * dx, p.y).reshape(-1),
     )
     half = root(1.0 - kept.c**2)
-    x = jnp.concatenate([free.x, crossings[0], kept.c * kept.x - half * kept.y, kept.c * kept.x + half * kept.y])
-    y = jnp.concatenate([free.y, crossings[1], kept.c * kept.y + half * kept.x, kept.c * kept.y - half * kept.x])
+    x = jnp.concatenate(
+        [free.x, crossings[0], kept.c * kept.x - half * kept.y, kept.c * kept.x + half * kept.y]
+    )
+    y = jnp.concatenate(
+        [free.y, crossings[1], kept.c * kept.y + half * kept.x, kept.c * kept.y - half * kept.x]
+    )
     on_circle = jnp.abs(x**2 + y**2 - 1.0) <= 64.0 * eps
     violation = rows.c - x[:, None] * rows.x - y[:, None] * rows.y
     excess = jnp.maximum(jnp.max(violation[:, :first], axis=1, initial=-jnp.inf), 0.0)

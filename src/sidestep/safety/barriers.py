@@ -1,0 +1,258 @@
+"""Control barrier functions and their rows: what the evader's velocity must satisfy to stay free.
+
+A barrier h is at least 0 where the evader is free of one other robot. With class-K function alpha its row
+n.u >= c demands h' >= -alpha(h) of the evader's velocity u (m/s, world axes), so that h never crosses 0.
+"""
+
+import abc
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep.pursuit.game import CaptureGame
+from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+_KEEP_SIDE = 0.5
+_LOST_SIDE = 0.1
+
+
+class BarrierRows(eqx.Module):
+    """Values h (m) and rows n.u >= c of n barriers, n.u in m/s."""
+
+    values: Float[Array, "n"]
+    normals: Float[Array, "n 2"]
+    offsets: Float[Array, "n"]
+
+    @property
+    def value(self) -> Scalar:
+        """The composed barrier: the least of all, +inf when there is none."""
+        return jnp.min(self.values, initial=jnp.inf)
+
+
+def compose(*rows: BarrierRows) -> BarrierRows:
+    """Boolean AND of barriers: the value is the least, and all rows hold.
+
+    h_c = min h_i (paper, eq. Boolean; Glotfelter, Cortes, Egerstedt, "Nonsmooth barrier functions with
+    applications to multi-robot systems", 2017). Demanding every row, not only that of the least barrier,
+    keeps the action continuous where two barriers meet.
+    """
+    return BarrierRows(
+        jnp.concatenate([entry.values for entry in rows]),
+        jnp.concatenate([entry.normals for entry in rows]),
+        jnp.concatenate([entry.offsets for entry in rows]),
+    )
+
+
+class Barrier(eqx.Module):
+    """One kind of barrier, kept towards every robot of a kind.
+
+    `memory ()` is what must be remembered about one robot from step to step; barriers without memory
+    leave it 0. All methods but `rows` and `remember` take one evader position (m) and one other robot.
+    """
+
+    @abc.abstractmethod
+    def robots(self, world: World) -> Float[Array, "n d"]:
+        """The robots this barrier is kept towards, as the world holds them."""
+
+    @abc.abstractmethod
+    def value(
+        self,
+        scenario: Scenario,
+        evader: Float[AnyArray, "2"],
+        robot: Float[AnyArray, "d"],
+        memory: Float[AnyArray, ""],
+    ) -> Scalar:
+        """h (m)."""
+
+    @abc.abstractmethod
+    def row(
+        self,
+        scenario: Scenario,
+        evader: Float[AnyArray, "2"],
+        robot: Float[AnyArray, "d"],
+        memory: Float[AnyArray, ""],
+    ) -> tuple[Float[Array, "2"], Scalar]:
+        """Unit normal n = dh/dp_e and offset c (m/s) of the row n.u >= c."""
+
+    @abc.abstractmethod
+    def recall(
+        self,
+        scenario: Scenario,
+        evader: Float[AnyArray, "2"],
+        robot: Float[AnyArray, "d"],
+        memory: Float[AnyArray, ""] | None,
+    ) -> Scalar:
+        """The memory to use now, given the one of the step before, or none at the start."""
+
+    def remember(
+        self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"] | None = None
+    ) -> Float[Array, "n"]:
+        """`recall` for every robot."""
+        if memory is None:
+            return jax.vmap(lambda robot: self.recall(scenario, world.evader, robot, None))(
+                self.robots(world)
+            )
+        return jax.vmap(lambda robot, side: self.recall(scenario, world.evader, robot, side))(
+            self.robots(world), memory
+        )
+
+    def rows(self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"]) -> BarrierRows:
+        """Value and row towards every robot; `memory` as `remember` returned it for this world."""
+
+        def one(robot: Any, side: Any) -> BarrierRows:
+            normal, offset = self.row(scenario, world.evader, robot, side)
+            return BarrierRows(
+                self.value(scenario, world.evader, robot, side)[None], normal[None], offset[None]
+            )
+
+        rows = jax.vmap(one)(self.robots(world), memory)
+        return BarrierRows(rows.values[:, 0], rows.normals[:, 0], rows.offsets[:, 0])
+
+
+def _away(offset: Float[Array, "2"]) -> tuple[Scalar, Float[Array, "2"]]:
+    """Distance and unit direction; at distance 0, where every direction is as good, +x."""
+    squared = jnp.sum(offset**2)
+    apart = squared > 0.0
+    norm = jnp.sqrt(jnp.where(apart, squared, 1.0))
+    return jnp.where(apart, norm, 0.0), jnp.where(apart, offset / norm, jnp.array([1.0, 0.0], offset.dtype))
+
+
+@final
+class ObstacleBarrier(Barrier):
+    """The paper's barrier towards a drifting obstacle (eq. h_obstacle, Au1).
+
+    h = |p_e - p_c| - d_oc,  n = (p_e - p_c)/|p_e - p_c|,  c = n.v_c - gamma_oc h.
+    """
+
+    def robots(self, world: World) -> Float[Array, "n 4"]:
+        return world.obstacles
+
+    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+        return _away(evader - robot[:2])[0] - scenario.collision_distance
+
+    def row(
+        self, scenario: Scenario, evader: Any, robot: Any, memory: Any
+    ) -> tuple[Float[Array, "2"], Scalar]:
+        distance, normal = _away(evader - robot[:2])
+        h = distance - scenario.collision_distance
+        return normal, jnp.sum(normal * robot[2:]) - scenario.obstacle_gain * h
+
+    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+        return jnp.zeros_like(real(evader)[0])
+
+
+@final
+class RangeBarrier(Barrier):
+    """The paper's barrier towards the pursuer (eq. h_pv, Au2), which takes it to drive straight on at V.
+
+    h = |p_e - p_d| - l,  n = (p_e - p_d)/|p_e - p_d|,  c = V n.(cos theta, sin theta) - gamma_pv h.
+
+    This is the paper's derivation; its printed b_pv has the sign of the pursuer's velocity turned round.
+    The row cannot be kept close ahead of the pursuer, where n.u <= v_e < V: there h < (V - v_e)/gamma_pv.
+    """
+
+    def robots(self, world: World) -> Float[Array, "n 3"]:
+        return world.pursuers
+
+    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+        return _away(evader - robot[:2])[0] - scenario.capture_distance
+
+    def row(
+        self, scenario: Scenario, evader: Any, robot: Any, memory: Any
+    ) -> tuple[Float[Array, "2"], Scalar]:
+        distance, normal = _away(evader - robot[:2])
+        h = distance - scenario.capture_distance
+        approach = scenario.pursuer_speed * (normal[0] * jnp.cos(robot[2]) + normal[1] * jnp.sin(robot[2]))
+        return normal, approach - scenario.pursuer_gain * h
+
+    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+        return jnp.zeros_like(real(evader)[0])
+
+
+@final
+class PursuitBarrier(Barrier):
+    """The barrier of the capture game: holds against every admissible motion of the pursuer.
+
+    h is the signed distance from the capture set, see `CaptureGame.barrier`, and the row is
+    n.u >= V max(|n_x|, |sigma|/b) - alpha(h), the right side being the fastest the pursuer can lower h.
+
+    With h_max = l_max - l, alpha(h) = gamma min(h, h_max) + max(gamma, (V/b) tan S) (h - h_max)+: the gain
+    gamma as far as any gain will do (0 <= h <= h_max), and beyond it at least the slope that keeps the row
+    feasible. So for l <= l_max every h >= 0 has a feasible row, whatever the gain. For l > l_max the
+    pursuer wins, rows near its axis cannot be kept, and the filter answers with the least violation.
+
+    **Memory**: the side (+1 left, -1 right of the pursuer's axis) of the tangent line to follow in front
+    and behind. On the axis either side's row is feasible but not both, and changing sides at every crossing
+    would hold the evader on the axis until it is caught. So a side once taken is kept beyond the axis, as
+    long as its own row stays feasible: across the axis by |y|, that is
+    |y| <= cos S (b rho - (l + h) tan S + (b/V) alpha(h)), which for h = 0 is m cos S with
+    m = b rho - l tan S. It is left at half of that, for the evader's own side, whose h is larger.
+    """
+
+    def robots(self, world: World) -> Float[Array, "n 3"]:
+        return world.pursuers
+
+    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+        return CaptureGame.of(scenario).barrier(to_pursuer_frame(evader, robot), memory)[0]
+
+    def row(
+        self, scenario: Scenario, evader: Any, robot: Any, memory: Any
+    ) -> tuple[Float[Array, "2"], Scalar]:
+        game = CaptureGame.of(scenario)
+        z = to_pursuer_frame(evader, robot)
+        h, normal = game.barrier(z, memory)
+        cosine, sine = jnp.cos(robot[2]), jnp.sin(robot[2])
+        ahead, left = normal[0], normal[1]
+        world_normal = jnp.stack([cosine * ahead - sine * left, sine * ahead + cosine * left])
+        # A pursuer that turns at no cost (b = 0) has no finite rate; any that cannot be kept says the same.
+        rate = jnp.minimum(game.pursuit_rate(z, normal), 1e3 * game.pursuer_speed)
+        return world_normal, rate - self.allowance(scenario, h)
+
+    def allowance(self, scenario: Scenario, h: Float[AnyArray, ""]) -> Scalar:
+        """alpha(h) (m/s): how fast h may shrink."""
+        game = CaptureGame.of(scenario)
+        gain, axle = scenario.pursuer_gain, game.half_axle
+        spare = jnp.maximum(game.largest_capture_distance - game.capture_distance, 0.0)
+        turning = game.pursuer_speed * jnp.tan(game.usable_angle) / jnp.where(axle > 0.0, axle, 1.0)
+        steep = jnp.maximum(gain, jnp.where(axle > 0.0, turning, 0.0))
+        return gain * jnp.minimum(h, spare) + steep * jnp.maximum(h - spare, 0.0)
+
+    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+        game = CaptureGame.of(scenario)
+        z = to_pursuer_frame(evader, robot)
+        own_side = jnp.where(z[1] < 0.0, -1.0, 1.0).astype(z.dtype)
+        if memory is None:
+            return own_side
+        side = jnp.where(real(memory) < 0.0, -1.0, 1.0).astype(z.dtype)
+        return jnp.where(self._may_keep(scenario, game, z, side), side, own_side)
+
+    def _may_keep(self, scenario: Scenario, game: CaptureGame, z: Float[Array, "2"], side: Scalar) -> Flag:
+        cosine, sine = jnp.cos(game.usable_angle), jnp.sin(game.usable_angle)
+        ahead, across = jnp.abs(z[0]), jnp.maximum(-side * z[1], 0.0)
+        in_front = jnp.abs(z[1]) * cosine < ahead * sine
+
+        def reach(h: Scalar) -> Scalar:
+            """How far across the axis the row of a side with value h stays feasible (m)."""
+            turn = game.half_axle * (game.evader_speed + self.allowance(scenario, h)) / game.pursuer_speed
+            return cosine * turn - sine * (game.capture_distance + h)
+
+        h = ahead * cosine - across * sine - game.capture_distance
+        own = ahead * cosine + across * sine - game.capture_distance
+        feasible = (h >= 0.0) & (across <= _KEEP_SIDE * reach(h))
+        # With no side left to save it, the evader still does best to commit to one.
+        lost = (own < 0.0) | (reach(own) < 0.0)
+        return in_front & (feasible | (lost & (across <= _LOST_SIDE * game.capture_distance)))
+
+
+BARRIERS: dict[str, Barrier] = {
+    "obstacle": ObstacleBarrier(),
+    "range": RangeBarrier(),
+    "pursuit": PursuitBarrier(),
+}
+"""Every barrier by name."""

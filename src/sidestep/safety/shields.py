@@ -1,0 +1,179 @@
+"""Shields: from the action a policy would take to the action a robot may take, with a status."""
+
+import abc
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sidestep._arrays import AnyArray, Scalar
+from sidestep.safety.barriers import (
+    Barrier,
+    BarrierRows,
+    ObstacleBarrier,
+    PursuitBarrier,
+    RangeBarrier,
+    compose,
+)
+from sidestep.safety.filter import project
+from sidestep.safety.least_violation import root
+from sidestep.safety.status import Status
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+_PLANNED = ("joint",)
+
+
+class ShieldResult(eqx.Module):
+    """What a shield decided.
+
+    - `action (2,)` the velocity to execute, m/s in world axes; always finite and within the speed limit
+    - `status` see `Status`
+    - `barriers (m + k,)` h in m, pursuers first; -inf where the world was not finite
+    - `slack` m/s by which the action keeps the tightest row (negative: violates); +inf without rows
+    - `intervention` |action - nominal|, m/s
+    """
+
+    action: Float[Array, "2"]
+    status: Int[Array, ""]
+    barriers: Float[Array, "n"]
+    slack: Scalar
+    intervention: Scalar
+
+
+class Shield(eqx.Module):
+    """A shield for one scenario. `memory = shield.init(world)`; then one call per control period.
+
+    The scenario's gains, speeds and distances are traced: other values never recompile.
+    """
+
+    scenario: eqx.AbstractVar[Scenario]
+
+    @abc.abstractmethod
+    def init(self, world: World) -> Any:
+        """The memory (a pytree) at the start of an episode."""
+
+    @abc.abstractmethod
+    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+        """Filter the nominal velocity (m/s, world axes).
+
+        **Returns** the `ShieldResult` and the memory for the next call. Non-finite input (a nominal
+        action, a pose) gives `Status.INVALID` and an action as close to a stop as the rest allows.
+        """
+
+
+def _decide(
+    scenario: Scenario, nominal: Float[AnyArray, "2"], rows: BarrierRows, *, enforced: bool, hard: int
+) -> ShieldResult:
+    nominal = jnp.asarray(nominal, rows.values.dtype)
+    known = (
+        jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets) & jnp.all(jnp.isfinite(rows.normals), axis=-1)
+    )
+    wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
+    # With part of the world unknown nothing vouches for the nominal action.
+    vouched = jnp.where(jnp.all(known), nominal, 0.0)
+    count = rows.offsets.shape[0] if enforced else 0
+    projection = project(
+        vouched,
+        rows.normals[:count],
+        rows.offsets[:count],
+        scenario.evader_speed,
+        hard=hard if enforced else 0,
+        circle=scenario.action == "heading",
+    )
+    status = jnp.where(jnp.all(known), projection.status, Status.INVALID).astype(projection.status.dtype)
+    return ShieldResult(
+        action=projection.action,
+        status=status,
+        barriers=jnp.where(known, rows.values, -jnp.inf),
+        slack=projection.slack,
+        intervention=root(jnp.sum((projection.action - wanted) ** 2)),
+    )
+
+
+def _with_obstacles(
+    barrier: Barrier, scenario: Scenario, world: World, memory: Float[Array, "m"]
+) -> BarrierRows:
+    """Rows towards all pursuers, then towards all obstacles."""
+    obstacle = ObstacleBarrier()
+    towards_pursuers = barrier.rows(scenario, world, memory)
+    return compose(towards_pursuers, obstacle.rows(scenario, world, obstacle.remember(scenario, world)))
+
+
+@final
+class NoShield(Shield):
+    """Executes the nominal action as it is, cut to the speed limit; reports distances as barriers.
+
+    Status `OK` or `CORRECTED` (by the speed limit), or `INVALID` and a stop for a non-finite action or
+    world.
+    """
+
+    scenario: Scenario
+
+    def init(self, world: World) -> Any:
+        return RangeBarrier().remember(self.scenario, world)
+
+    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+        rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
+        return _decide(self.scenario, nominal, rows, enforced=False, hard=0), memory
+
+
+@final
+class PaperShield(Shield):
+    """The paper's shield: `RangeBarrier` towards pursuers, `ObstacleBarrier` towards obstacles.
+
+    Kept as the baseline. Its pursuer row cannot always be kept (see `RangeBarrier`); then the answer
+    violates the pursuers' rows least, and the obstacles' rows least after that.
+    """
+
+    scenario: Scenario
+
+    def init(self, world: World) -> Any:
+        return RangeBarrier().remember(self.scenario, world)
+
+    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+        rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
+        return _decide(self.scenario, nominal, rows, enforced=True, hard=self.scenario.pursuer_count), memory
+
+
+@final
+class GameShield(Shield):
+    """`PursuitBarrier` towards pursuers, kept before the `ObstacleBarrier` rows when not all can hold.
+
+    Against one pursuer in the unbounded plane, in continuous time and with l <= l_max, the pursuit row can
+    always be kept, and then there is no capture. Sampling, several pursuers and obstacles beside them are
+    outside that statement.
+    """
+
+    scenario: Scenario
+
+    def init(self, world: World) -> Any:
+        return PursuitBarrier().remember(self.scenario, world)
+
+    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+        memory = PursuitBarrier().remember(self.scenario, world, memory)
+        rows = _with_obstacles(PursuitBarrier(), self.scenario, world, memory)
+        return _decide(self.scenario, nominal, rows, enforced=True, hard=self.scenario.pursuer_count), memory
+
+
+SHIELDS: dict[str, type[Shield]] = {"none": NoShield, "paper": PaperShield, "game": GameShield}
+"""Every shield by name."""
+
+
+def make_shield(name: str, scenario: Scenario) -> Shield:
+    """The shield `name` (a key of `SHIELDS`) for a scenario.
+
+    **Raises** `ValueError` naming the known shields.
+    """
+    if name in SHIELDS:
+        return SHIELDS[name](scenario)
+    known = ", ".join(map(repr, SHIELDS))
+    if name in _PLANNED:
+        raise ValueError(f"shield {name!r} is planned but not built yet; use one of {known}")
+    raise ValueError(f"no shield {name!r}; use one of {known}")
+
+
+def as_shield(shield: str | Shield, scenario: Scenario) -> Shield:
+    """`shield` itself, or the one of that name for `scenario`."""
+    return make_shield(shield, scenario) if isinstance(shield, str) else shield
