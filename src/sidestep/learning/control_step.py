@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import AnyArray, real
 from sidestep.world.events import Events
@@ -30,6 +30,16 @@ def decision_steps_of(policy: object) -> int:
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         raise ValueError(f"the policy's decision_steps = {steps!r}: it must be a whole number of at least 1")
     return steps
+
+
+RUNNING = -1
+"""Outcome of an episode that has not ended."""
+
+
+def outcome_of(events: Events) -> Int[Array, ""]:
+    """Index into `records.OUTCOMES` of what ended the episode in this period, -1 if nothing did."""
+    flags = jnp.stack([events.captured, events.collided, events.reached, events.timed_out])
+    return jnp.where(jnp.any(flags), jnp.argmax(flags), RUNNING).astype(jnp.int32)
 
 
 def decide(scenario: Scenario, policy: Callable[..., Any], world: World) -> Float[Array, "2"]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 
 from sidestep._arrays import Scalar, real
 from sidestep.learning.td3 import TD3
@@ -24,6 +24,7 @@ class TrainingOptions(eqx.Module):
     - `hindsight`: share of each batch read with a place reached later as its target.
     - `mirror`: share of each batch reflected left to right, which is the same problem seen in a mirror.
     - `reward_scale`: multiplies rewards inside the learner only; reported returns are the paper's.
+    - `bound_values`: cut target values at the reward for reaching, since no return can exceed it.
     - `replay_action`: `"proposed"` (the policy's) or `"executed"` (the shield's answer; the target
       action then passes through the shield too).
     - `correction_penalty`: reward taken off per decision in which the shield corrected by v_e throughout.
@@ -36,9 +37,82 @@ class TrainingOptions(eqx.Module):
     reward_scale: Scalar = eqx.field(converter=real, default=0.01)
     correction_penalty: Scalar = eqx.field(converter=real, default=0.0)
     mirror: Scalar = eqx.field(converter=real, default=0.5)
+    bound_values: bool = eqx.field(static=True, default=True)
     replay_action: str = eqx.field(static=True, default="proposed")
     decision_steps: int = eqx.field(static=True, default=10)
     batch_size: int = eqx.field(static=True, default=256)
     updates_per_decision: int = eqx.field(static=True, default=1)
     warmup_decisions: int = eqx.field(static=True, default=256)
     replay_capacity: int = eqx.field(static=True, default=1_000_000)
+
+
+_FLOATS = {
+    "exploration_noise": (0.0, math.inf), "hindsight": (0.0, 1.0), "mirror": (0.0, 1.0),
+    "reward_scale": (0.0, math.inf), "correction_penalty": (0.0, math.inf),
+    "actor_learning_rate": (0.0, math.inf), "critic_learning_rate": (0.0, math.inf),
+    "discount": (0.0, 1.0), "target_rate": (0.0, 1.0), "target_noise": (0.0, math.inf),
+    "target_noise_clip": (0.0, math.inf), "last_layer_scale": (0.0, math.inf),
+}  # fmt: skip
+_WHOLE = {
+    "decision_steps": 1, "batch_size": 1, "updates_per_decision": 1, "warmup_decisions": 1,
+    "replay_capacity": 1, "policy_delay": 1,
+}  # fmt: skip
+_REPLAY_ACTIONS = ("proposed", "executed")
+
+
+def make_options(**values: Any) -> TrainingOptions:
+    """Validated options from plain values, `TrainingOptions`' and `TD3`'s fields side by side.
+
+    `make_options(discount=0.98, updates_per_decision=3)`; what is not given keeps its default.
+
+    **Raises** `ValueError` naming the option, its value and what is allowed.
+    """
+    algorithm_fields = [field.name for field in dataclasses.fields(TD3)]
+    loop_fields = [field.name for field in dataclasses.fields(TrainingOptions) if field.name != "algorithm"]
+    for name, value in values.items():
+        if name not in algorithm_fields + loop_fields:
+            near = difflib.get_close_matches(name, algorithm_fields + loop_fields, n=1)
+            raise ValueError(
+                f"unknown training option '{name}'" + (f"; did you mean '{near[0]}'?" if near else "")
+            )
+        _check(name, value)
+    values = {**values, "hidden": tuple(values["hidden"])} if "hidden" in values else values
+    algorithm = TD3(**{name: value for name, value in values.items() if name in algorithm_fields})
+    return TrainingOptions(
+        algorithm=algorithm, **{name: value for name, value in values.items() if name in loop_fields}
+    )
+
+
+def _check(name: str, value: Any) -> None:
+    def fail(allowed: str) -> None:
+        raise ValueError(f"training option '{name}' = {value!r}: {allowed}")
+
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if name in _FLOATS:
+        low, high = _FLOATS[name]
+        if not number or not math.isfinite(value) or not low <= value <= high:
+            fail(f"it must be a finite number from {low:g} to {high:g}")
+    elif name == "bound_values":
+        if not isinstance(value, bool):
+            fail("it must be true or false")
+    elif name in _WHOLE:
+        if not number or value != int(value) or value < _WHOLE[name]:
+            fail(f"it must be a whole number of at least {_WHOLE[name]}")
+    elif name == "replay_action":
+        if value not in _REPLAY_ACTIONS:
+            fail(f"it must be one of {', '.join(map(repr, _REPLAY_ACTIONS))}")
+    elif name == "hidden" and not (
+        isinstance(value, (list, tuple)) and value and all(isinstance(n, int) and n > 0 for n in value)
+    ):
+        fail("it must be layer widths, such as (256, 256)")
+
+
+def options_to_dict(options: TrainingOptions) -> dict[str, Any]:
+    """All options as plain JSON values; `make_options` rebuilds them."""
+    values: dict[str, Any] = {}
+    for owner in (options.algorithm, options):
+        for field in dataclasses.fields(owner):
+            value = getattr(owner, field.name)
+            if field.name != "algorithm":
+                values[field.name] = float(str(value)) if isinstance(value, jax.Array) else value
+    return values

@@ -34,7 +34,6 @@ class TD3(eqx.Module):
     target_rate: Scalar = eqx.field(converter=real, default=0.005)
     target_noise: Scalar = eqx.field(converter=real, default=0.2)
     target_noise_clip: Scalar = eqx.field(converter=real, default=0.5)
-    value_limit: Scalar = eqx.field(converter=real, default=jnp.inf)
     policy_delay: int = eqx.field(static=True, default=2)
     hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
     last_layer_scale: float = eqx.field(static=True, default=1.0)
@@ -79,7 +78,7 @@ class Batch(eqx.Module):
 
 
 class Losses(eqx.Module):
-    """Diagnostics of one update."""
+    """Diagnostics of one update; `actor` is 0 in the updates that leave the actor alone."""
 
     critic: Scalar
     actor: Scalar
@@ -92,7 +91,9 @@ def _no_bound(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float
 
 def _adam(gradients, moments, network, rate: Scalar):
     """One Adam step with a traced learning rate."""
-    directions, moments = optax.scale_by_adam().update(gradients, moments)
+    # Optax raises floats to integer powers, which strict promotion forbids.
+    with jax.numpy_dtype_promotion("standard"):
+        directions, moments = optax.scale_by_adam().update(gradients, moments)
     return jax.tree.map(lambda weight, direction: weight - rate * direction, network, directions), moments
 
 
@@ -103,6 +104,7 @@ def update(
     key: PRNGKeyArray,
     bound: Bound = _no_bound,
     target_bound: Bound | None = None,
+    value_limit: Scalar | None = None,
 ) -> tuple[Learner, Losses]:
     """One TD3 update.
 
@@ -112,7 +114,8 @@ def update(
 
     `bound` maps actions onto those the robot can execute (a disc, say) before any critic judges them;
     `target_bound` does so for the target action alone (the safety filter, when executed actions are
-    learned from) and is `bound` unless given.
+    learned from) and is `bound` unless given. `value_limit`, when given, is the largest value there can be:
+    y is cut to it.
     """
     noise_key, bound_key, actor_key = jax.random.split(key, 3)
     target_bound = bound if target_bound is None else target_bound
@@ -123,7 +126,8 @@ def update(
     next_action = target_bound(smoothed, bound_key)
     next_values = learner.target_critic(batch.next_observation, next_action)
     wanted = batch.reward + algorithm.discount * (1.0 - batch.terminated) * jnp.minimum(*next_values)
-    wanted = jnp.minimum(wanted, algorithm.value_limit)
+    if value_limit is not None:
+        wanted = jnp.minimum(wanted, value_limit)
 
     def critic_loss(critic: TwinCritic) -> tuple[Scalar, Scalar]:
         first, second = critic(batch.observation, batch.action)
@@ -163,7 +167,7 @@ def update(
             learner,
             (critic, critic_moments, learner.updates + 1),
         )
-        return moved, real(jnp.nan)
+        return moved, real(0.0)
 
     due = (learner.updates + 1) % algorithm.policy_delay == 0
     learner, actor_error = jax.lax.cond(due, delayed, not_yet, learner)

@@ -10,15 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, Flag, Scalar, real
-from sidestep.learning.control_step import control_step
+from sidestep.learning.control_step import RUNNING, control_step, outcome_of
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.replay import Replay, Transition, on_disc, sample
 from sidestep.learning.td3 import Learner, Losses, update
+from sidestep.safety.status import Status
 from sidestep.world import Scenario, World, observation_size, observe, to_action, to_velocity
-
-CAPTURED, COLLIDED, REACHED, TIMED_OUT = range(4)
-OUTCOMES = ("captured", "collided", "reached", "timed_out")
-
 
 class Tally(eqx.Module):
     """What one episode has come to so far. Clearances in m, correction in m/s summed over periods."""
@@ -128,17 +125,13 @@ def _drive(
                 steps=tally.steps + 1,
                 pursuer_clearance=jnp.minimum(tally.pursuer_clearance, events.pursuer_clearance),
                 obstacle_clearance=jnp.minimum(tally.obstacle_clearance, events.obstacle_clearance),
-                interventions=tally.interventions + (result.status != 0).astype(tally.steps.dtype),
-                infeasible=tally.infeasible + (result.status >= 2).astype(tally.steps.dtype),
+                interventions=tally.interventions + (result.status != Status.OK).astype(tally.steps.dtype),
+                infeasible=tally.infeasible + (result.status == Status.INFEASIBLE).astype(tally.steps.dtype),
                 correction=tally.correction + result.intervention,
             ),
             alive=~(events.terminated | events.truncated),
             lost=events.captured | events.collided,
-            outcome=jnp.where(
-                events.captured,
-                CAPTURED,
-                jnp.where(events.collided, COLLIDED, jnp.where(events.reached, REACHED, TIMED_OUT)),
-            ).astype(carry.outcome.dtype),
+            outcome=outcome_of(events),
             steps=carry.steps + 1,
             executed=carry.executed + result.action,
             correction=carry.correction + result.intervention,
@@ -152,7 +145,7 @@ def _drive(
         tally=state.tally,
         alive=jnp.asarray(True),
         lost=jnp.asarray(False),
-        outcome=jnp.asarray(0),
+        outcome=jnp.asarray(RUNNING, jnp.int32),
         steps=jnp.asarray(0),
         executed=jnp.zeros_like(nominal),
         correction=real(0.0),
@@ -186,7 +179,8 @@ def _learn(
             return jax.vmap(filtered)(next_world, actions)
 
         target_bound = through_shield if options.replay_action == "executed" else on_disc
-        return update(options.algorithm, learner, batch, update_key, on_disc, target_bound)
+        best = options.reward_scale * scenario.reach_reward if options.bound_values else None
+        return update(options.algorithm, learner, batch, update_key, on_disc, target_bound, best)
 
     learner, losses = jax.lax.scan(one, learner, jax.random.split(key, options.updates_per_decision))
     return learner, jax.tree.map(lambda loss: loss[-1], losses)

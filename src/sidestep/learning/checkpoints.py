@@ -1,0 +1,164 @@
+"""Checkpoints: the whole training state as plain arrays, written whole or not at all.
+
+A checkpoint is one `.npz` file of named arrays without pickled objects, plus a digest of its content; a kill
+at any moment leaves the one before it intact. Only the part of the replay that has been filled is stored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.learning.records import RunError, write_bytes
+
+_NAME = re.compile(r"episodes-(\d+)\.npz")
+_KEPT = 2
+_MANIFEST = "manifest"
+Tree = TypeVar("Tree")
+
+
+class CheckpointError(RunError):
+    """A checkpoint that cannot be used: damaged, or of another kind of training."""
+
+
+def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return [(jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _plain(leaf: Any) -> np.ndarray:
+    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _rows_of(name: str, rows: dict[str, int]) -> int | None:
+    for prefix, count in rows.items():
+        if name == prefix or name.startswith(prefix + "."):
+            return count
+    return None
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name}:{array.dtype.str}:{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, **about: Any) -> None:
+    """Write a pytree of arrays, whole or not at all, with `about` beside them.
+
+    Of leaves at or below a name in `rows` only that many first rows are kept; reading fills them up again
+    with the example's rows, which may be more than there were.
+    """
+    rows = rows or {}
+    arrays = {name: _plain(leaf)[: _rows_of(name, rows)] if _rows_of(name, rows) is not None else _plain(leaf)
+              for name, leaf in _named_leaves(tree)}  # fmt: skip
+    manifest = json.dumps({**about, "digest": _digest(arrays), "rows": rows})
+    buffer = io.BytesIO()
+    np.savez(buffer, **{_MANIFEST: np.frombuffer(manifest.encode(), np.uint8)}, **_slots(arrays))
+    write_bytes(path, buffer.getvalue())
+
+
+def _slots(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    # Pytree paths make poor file names inside a zip; positions with the names beside them do not.
+    names = np.frombuffer(json.dumps(list(arrays)).encode(), np.uint8)
+    return {"names": names, **{f"leaf{i}": array for i, array in enumerate(arrays.values())}}
+
+
+def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays by pytree path, and the manifest. **Raises** `CheckpointError` when the file is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            manifest = json.loads(bytes(file[_MANIFEST]))
+            names = json.loads(bytes(file["names"]))
+            arrays = {name: file[f"leaf{i}"] for i, name in enumerate(names)}
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} does not exist") from None
+    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path} is damaged ({error}); remove it to fall back on the one before it") from None
+    if _digest(arrays) != manifest.get("digest"):
+        raise CheckpointError(f"{path} is damaged (its digest differs); remove it to fall back on the one before it")
+    return arrays, manifest
+
+
+def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
+    """The pytree that `write_arrays` stored, shaped like `example`, and what was stored beside it.
+
+    **Raises** `CheckpointError` when the file is damaged or does not fit `example`.
+    """
+    arrays, manifest = read_named(path)
+    leaves = []
+    for name, leaf in _named_leaves(example):
+        wanted = _plain(leaf)
+        if name not in arrays:
+            raise CheckpointError(f"{path} lacks {name}: it was written by another version or with other options")
+        array = arrays.pop(name)
+        if _rows_of(name, manifest["rows"]) is not None and array.shape[1:] == wanted.shape[1:]:
+            array = np.concatenate([array, wanted[len(array) :]])
+        if array.shape != wanted.shape or array.dtype != wanted.dtype:
+            raise CheckpointError(
+                f"{path}: {name} is {array.dtype}{list(array.shape)}, but {wanted.dtype}{list(wanted.shape)} is "
+                "needed: it was written with another scenario, other options or another float precision"
+            )
+        value = jnp.asarray(array)
+        leaves.append(jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else value)
+    if arrays:
+        raise CheckpointError(f"{path} holds {', '.join(list(arrays)[:3])} that this version does not know")
+    return jax.tree.unflatten(jax.tree.structure(example), leaves), manifest
+
+
+def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> Path:
+    """Write the training state after the episodes it has seen; the two newest checkpoints are kept."""
+    folder = Path(folder) / "checkpoints"
+    episodes = int(state.episodes)
+    path = folder / f"episodes-{episodes:06d}.npz"
+    filled = min(int(state.replay.written), state.replay.capacity)
+    write_arrays(
+        path,
+        state,
+        rows={
+            ".replay.transitions": filled,
+            ".replay.episode": filled,
+            ".replay.episode_last": min(episodes + 1, state.replay.capacity),
+        },
+        episodes=episodes,
+        wall_seconds=wall_seconds,
+    )
+    for old in list_checkpoints(folder.parent)[:-_KEPT]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def list_checkpoints(folder: str | Path) -> list[Path]:
+    """Checkpoints of a run, oldest first."""
+    found = [path for path in (Path(folder) / "checkpoints").glob("*.npz") if _NAME.fullmatch(path.name)]
+    return sorted(found, key=lambda path: int(_NAME.fullmatch(path.name).group(1)))  # type: ignore[union-attr]
+
+
+def read_checkpoint(folder: str | Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
+    """The newest checkpoint of a run that is whole; one damaged on disk falls back on the one before it.
+
+    **Raises** `CheckpointError` when there is none, or none that fits `example`.
+    """
+    problem: CheckpointError | None = None
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            return read_arrays(path, example)
+        except CheckpointError as error:
+            problem = problem or error
+    raise problem or CheckpointError(f"{folder} has no checkpoint; start the run again without --resume")

@@ -1,0 +1,63 @@
+"""The policy that a training leaves behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import final
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, real
+from sidestep.learning.checkpoints import read_arrays, read_named, write_arrays
+from sidestep.learning.networks import Actor
+from sidestep.learning.records import RunError, open_run
+
+_FILE = "policy.npz"
+
+
+@final
+class LearnedPolicy(eqx.Module):
+    """A trained actor: observation to action in [-1, 1]^2, asked every `decision_steps` control periods."""
+
+    actor: Actor
+    decision_steps: int = eqx.field(static=True)
+
+    def __call__(self, observation: Float[AnyArray, "observation"]) -> Float[Array, "2"]:
+        """**Raises** `ValueError` when the observation has another length than the policy was trained on."""
+        wanted = self.actor.body.weights[0].shape[0]
+        if observation.shape != (wanted,):
+            raise ValueError(
+                f"this policy was trained on observations of {wanted} entries, this scenario has "
+                f"{observation.shape[-1]}: use the frame, pursuer_count and obstacle_count of its training"
+            )
+        return self.actor(real(observation)[None])[0]
+
+
+def write_policy(folder: str | Path, policy: LearnedPolicy) -> Path:
+    """Write the policy of a run as `policy.npz`."""
+    path = Path(folder) / _FILE
+    weights = policy.actor.body.weights
+    sizes = [int(weights[0].shape[0]), *(int(weight.shape[1]) for weight in weights)]
+    write_arrays(path, policy.actor, sizes=sizes, decision_steps=policy.decision_steps)
+    return path
+
+
+def load_policy(run: str | Path) -> LearnedPolicy:
+    """The policy that a training left in its run folder, or in the `policy.npz` file given.
+
+    **Raises** `RunError` when the folder holds no run or its training has not written a policy yet, and
+    `CheckpointError` when the file is damaged.
+    """
+    path = Path(run)
+    if path.suffix != ".npz":
+        open_run(path)
+        path = path / _FILE
+        if not path.is_file():
+            raise RunError(f"{run} has no policy yet: its training has not ended; continue it with --resume")
+    _, manifest = read_named(path)
+    observations, *hidden, actions = manifest["sizes"]
+    example = Actor(observations, actions, tuple(hidden), jax.random.key(0))
+    actor, manifest = read_arrays(path, example)
+    return LearnedPolicy(actor, int(manifest["decision_steps"]))

@@ -1,0 +1,235 @@
+"""A training from the outside: run folder, progress, checkpoints, interruption and resume."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sidestep
+from sidestep.learning import records
+from sidestep.learning.checkpoints import read_checkpoint, write_checkpoint
+from sidestep.learning.curves import Curves
+from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
+from sidestep.learning.policy import LearnedPolicy, write_policy
+from sidestep.learning.training import Report, TrainState, run_chunk, start
+from sidestep.pursuit import as_pursuer
+from sidestep.safety import as_shield
+from sidestep.world import Scenario, load_scenario, scenario_to_dict
+
+CHUNK = 100
+"""Decisions per compiled call: about half a second of work, so progress and Ctrl-C feel immediate."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training is. `last` is the newest episode's line of `metrics.jsonl`, if one has ended."""
+
+    episode: int
+    episodes: int
+    safe: int
+    env_steps: int
+    steps_per_second: float
+    mean_return: float
+    last: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training gave: policy, `summary.json`, one entry per episode, and the state it ended in."""
+
+    policy: LearnedPolicy
+    summary: dict[str, Any]
+    metrics: list[dict[str, Any]]
+    state: TrainState
+    interrupted: bool = False
+    folder: Path | None = None
+    chunk_seconds: list[tuple[int, float]] = field(default_factory=list)
+
+
+def _capacity(options: TrainingOptions, scenario: Scenario, episodes: int) -> int:
+    most = episodes * -(-scenario.episode_steps // options.decision_steps)
+    return max(1, min(options.replay_capacity, most))
+
+
+def _name(thing: Any) -> str:
+    return thing if isinstance(thing, str) else getattr(thing, "name", type(thing).__name__)
+
+
+def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
+    """The lines of `metrics.jsonl` for the episodes that ended in a chunk."""
+    ended = np.flatnonzero(np.asarray(report.ended))
+    tally = jax.tree.map(lambda leaf: np.asarray(leaf)[ended], report.tally)
+    outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended]
+    return [
+        records.json_safe(
+            {
+                "episode": done + i + 1,
+                "outcome": records.OUTCOMES[outcome[i]],
+                "return": tally.total_reward[i],
+                "steps": tally.steps[i],
+                "env_steps": env_steps[i],
+                "min_pursuer_clearance": tally.pursuer_clearance[i],
+                "min_obstacle_clearance": tally.obstacle_clearance[i],
+                "interventions": tally.interventions[i],
+                "infeasible": tally.infeasible[i],
+                "mean_correction": tally.correction[i] / tally.steps[i],
+            }
+        )
+        for i in range(len(ended))
+    ]
+
+
+def resume_settings(folder: str | Path) -> dict[str, Any]:
+    """What `train` needs to continue a run as it was begun: scenario, shield, pursuer, seed, options, episodes.
+
+    **Raises** `RunError` when `folder` holds no run.
+    """
+    config = records.open_run(folder)
+    fields = dict(config["scenario"])
+    # The stored fields are complete, so whichever preset they start from leaves no trace.
+    return {
+        "scenario": load_scenario("paper", **fields),
+        "shield": config["shield"],
+        "pursuer": config["pursuer"],
+        "seed": config["seed"],
+        "episodes": config["episodes"],
+        "options": make_options(**config["learner"]),
+    }
+
+
+def train(
+    scenario: Scenario,
+    *,
+    shield: Any = "game",
+    pursuer: Any = "nash",
+    seed: int = 0,
+    episodes: int = 200,
+    options: TrainingOptions | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    checkpoint_seconds: float = 20.0,
+    chunk: int = CHUNK,
+) -> Training:
+    """Train a policy with TD3 while the shield keeps the evader safe.
+
+    With `out` the run is a folder: `config.json`, `metrics.jsonl`, checkpoints, TensorBoard curves, and at
+    the end `summary.json` and `policy.npz`. The same seed gives the same run on the same machine, whether
+    or not it was interrupted and resumed in between. `KeyboardInterrupt` stops it cleanly at the next
+    chunk, with a checkpoint to resume from.
+
+    **Arguments:** `shield` and `pursuer` names or objects; `resume` continues the run in `out`, whose
+    scenario, shield, pursuer, seed and options must be the ones given (`resume_settings` reads them) while
+    `episodes` may be larger; `progress` is called after every chunk of `chunk` decisions.
+
+    **Raises** `ValueError` for a bad argument, `RunError` when `out` already holds something and `resume` is
+    not set, or holds nothing to resume.
+    """
+    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("chunk", chunk, 1)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
+    options = make_options() if options is None else options
+    guard, hunter = as_shield(shield, scenario), as_pursuer(pursuer)
+    capacity = _capacity(options, scenario, episodes)
+    config = {
+        "scenario": scenario_to_dict(scenario),
+        "learner": options_to_dict(options),
+        "shield": _name(shield),
+        "pursuer": _name(pursuer),
+        "seed": int(seed),
+        "episodes": int(episodes),
+        "version": sidestep.__version__,
+    }
+    state = start(scenario, guard, options, jax.random.key(seed), capacity)
+    metrics: list[dict[str, Any]] = []
+    earlier = 0.0
+    folder = None if out is None else Path(out)
+    if folder is not None and resume:
+        state, earlier = _reopen(folder, config, state)
+        metrics = records.read_metrics(folder)
+    elif folder is not None:
+        records.create_run(folder, config)
+        write_checkpoint(folder, state, wall_seconds=0.0)
+
+    curves = None if folder is None else Curves(folder, purge_step=int(state.episodes) + 1)
+    begun = saved = time.perf_counter()
+    limit = jnp.asarray(episodes)
+    interrupted = False
+    chunk_seconds: list[tuple[int, float]] = []
+
+    def summary() -> dict[str, Any]:
+        about = {key: config[key] for key in ("scenario", "shield", "pursuer", "seed", "version")}
+        return records.summarise(metrics, wall_seconds=earlier + time.perf_counter() - begun, **about)
+
+    try:
+        while int(state.episodes) < episodes:
+            chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
+            reached, report = run_chunk(scenario, guard, hunter, options, state, limit, chunk)
+            lines = _episode_lines(report, len(metrics))
+            # One statement, so that an interrupt finds state and metrics of the same moment.
+            state, metrics = reached, metrics + lines
+            now = time.perf_counter()
+            chunk_seconds.append((int(state.env_steps) - steps_before, now - chunk_begun))
+            if folder is not None and curves is not None:
+                records.append_metrics(folder, lines)
+                curves.write(lines, report)
+                if now - saved >= checkpoint_seconds:
+                    write_checkpoint(folder, state, wall_seconds=earlier + now - begun)
+                    saved = now
+            if progress is not None:
+                steps, seconds = (sum(column) for column in zip(*chunk_seconds[-20:], strict=True))
+                progress(_progress(metrics, state, episodes, steps / seconds))
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        if curves is not None:
+            curves.close()
+        if folder is not None:
+            records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
+            write_checkpoint(folder, state, wall_seconds=earlier + time.perf_counter() - begun)
+            records.write_summary(folder, summary())
+
+    policy = LearnedPolicy(state.learner.actor, options.decision_steps)
+    if folder is not None and not interrupted:
+        write_policy(folder, policy)
+    return Training(policy, summary(), metrics, state, interrupted, folder, chunk_seconds)
+
+
+def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tuple[TrainState, float]:
+    """The state to continue from, the run's files cut back to it."""
+    stored = records.open_run(folder)
+    for name in ("scenario", "learner", "shield", "pursuer", "seed"):
+        if records.json_safe(stored.get(name)) != records.json_safe(config[name]):
+            raise records.RunError(
+                f"{folder} was begun with another {name}: {stored.get(name)!r}, not {config[name]!r}; "
+                "resume without changing it, or start another run with --out"
+            )
+    if config["episodes"] < stored["episodes"]:
+        raise records.RunError(
+            f"{folder} was begun for {stored['episodes']} episodes; it cannot be resumed for {config['episodes']}"
+        )
+    state, manifest = read_checkpoint(folder, example)
+    records.truncate_metrics(folder, int(state.episodes))
+    records.write_json(folder / "config.json", config)
+    return state, float(manifest["wall_seconds"])
+
+
+def _progress(metrics: list[dict[str, Any]], state: TrainState, episodes: int, rate: float) -> Progress:
+    recent = [line["return"] for line in metrics[-records.CONVERGENCE_WINDOW :]]
+    return Progress(
+        episode=len(metrics),
+        episodes=episodes,
+        safe=sum(line["outcome"] not in ("captured", "collided") for line in metrics),
+        env_steps=int(state.env_steps),
+        steps_per_second=rate,
+        mean_return=float(np.mean(recent)) if recent else float("nan"),
+        last=metrics[-1] if metrics else None,
+    )
+
