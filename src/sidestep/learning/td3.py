@@ -25,7 +25,8 @@ class TD3(eqx.Module):
     """Hyper-parameters. Real values are traced, so seeds may be `vmap`-ped over learning rates.
 
     Noises are in units of the action range [-1, 1]. `policy_delay` counts critic updates per update of
-    the actor and of both target networks.
+    the actor and of both target networks. `last_layer_scale` starts the actor near zero action (the
+    reference starts it at 1); everything else is the reference's.
     """
 
     actor_learning_rate: Scalar = eqx.field(converter=real, default=3e-4)
@@ -36,7 +37,7 @@ class TD3(eqx.Module):
     target_noise_clip: Scalar = eqx.field(converter=real, default=0.5)
     policy_delay: int = eqx.field(static=True, default=2)
     hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
-    last_layer_scale: float = eqx.field(static=True, default=1.0)
+    last_layer_scale: float = eqx.field(static=True, default=0.01)
 
     def init(self, observations: int, actions: int, key: PRNGKeyArray) -> Learner:
         """Fresh networks; targets start equal to them."""

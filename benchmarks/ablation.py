@@ -1,0 +1,86 @@
+"""What each addition to plain TD3 contributes: trainings without it, several seeds each.
+
+    python benchmarks/ablation.py --out benchmarks/results/ablation.json
+
+Finished trainings are kept in the output file and skipped when it is run again. Each training uses one
+core, so that several run side by side without disturbing one another.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "all additions": ({}, {}),
+    "without hindsight targets": ({"hindsight": 0.0}, {}),
+    "without target frame": ({}, {"frame": "world"}),
+    "without mirror images": ({"mirror": 0.0}, {}),
+    "without value bound": ({"bound_values": False}, {}),
+    "without small last layer": ({"last_layer_scale": 1.0}, {}),
+    "without reward scale": ({"reward_scale": 1.0}, {}),
+    "without any, deciding every 0.5 s": (
+        {"hindsight": 0.0, "mirror": 0.0, "bound_values": False, "last_layer_scale": 1.0, "reward_scale": 1.0},
+        {"frame": "world"},
+    ),
+    "three updates per decision": ({"updates_per_decision": 3}, {}),
+    "discount 0.98": ({"discount": 0.98}, {}),
+}
+"""Name, changed training options, changed scenario fields."""
+
+
+def one_training(variant: str, seed: int, episodes: int) -> dict[str, Any]:
+    """Train once on one core and say how it went."""
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    from sidestep.learning import make_options, train
+    from sidestep.world import load_scenario
+
+    options, fields = VARIANTS[variant]
+    training = train(
+        load_scenario("paper", **fields), shield="game", seed=seed, episodes=episodes, options=make_options(**options)
+    )
+    keys = ("episodes", "reached", "captured", "collided", "timed_out", "converged_episode", "final_return",
+            "env_steps", "wall_seconds")  # fmt: skip
+    return {
+        "variant": variant,
+        "seed": seed,
+        **{key: training.summary[key] for key in keys},
+        "outcomes": "".join(line["outcome"][0] for line in training.metrics),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ablation.json"))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--episodes", type=int, default=80)
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    arguments = parser.parse_args()
+
+    done: list[dict[str, Any]] = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
+    known = {(run["variant"], run["seed"], run["episodes"]) for run in done}
+    wanted = [
+        (variant, seed, arguments.episodes)
+        for variant in arguments.variants
+        for seed in range(arguments.seeds)
+        if (variant, seed, arguments.episodes) not in known
+    ]
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    # Spawned and never reused, so that every training starts from the same clean process.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(arguments.processes, mp_context=context, max_tasks_per_child=1) as pool:
+        for future in as_completed([pool.submit(one_training, *job) for job in wanted]):
+            run = future.result()
+            done.append(run)
+            print(f"{run['variant']}, seed {run['seed']}: {run['outcomes']}, converged {run['converged_episode']}")
+            beside = arguments.out.with_suffix(".tmp")
+            beside.write_text(json.dumps(sorted(done, key=lambda r: (r["variant"], r["seed"])), indent=1) + "\n")
+            os.replace(beside, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

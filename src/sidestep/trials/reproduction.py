@@ -1,0 +1,188 @@
+"""The paper's experiment as one study: train, measure and test under several shields, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sidestep
+from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, train
+from sidestep.learning import records
+from sidestep.pursuit import make_pursuer
+from sidestep.safety import make_shield
+from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.monte_carlo import evaluate
+from sidestep.trials.policies import GOAL_SEEKING
+from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
+from sidestep.world import Scenario, load_scenario, scenario_to_dict
+
+PAPER: dict[str, Any] = {
+    "episodes": 200,
+    "safe_episodes": 200,
+    "converged_within": 80,
+    "converged_return": 1000.0,
+    "scene_outcome": "reached",
+}
+"""What the paper reports (section IV and its Table I)."""
+
+Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
+"""Opens a progress display for a labelled part: a context manager that gives a callable."""
+
+
+@dataclass(frozen=True)
+class ShieldStudy:
+    """What the study found for one shield. Evaluations are `Evaluation.to_dict()`."""
+
+    shield: str
+    folder: Path
+    training: dict[str, Any]
+    trained: dict[str, Any]
+    untrained: dict[str, Any]
+    scene_trained: Trajectory
+    scene_untrained: Trajectory
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {
+            "training": self.training,
+            "trained": self.trained,
+            "untrained": self.untrained,
+            "scene_trained": describe(self.scene_trained),
+            "scene_untrained": describe(self.scene_untrained),
+        }
+
+
+def describe(trajectory: Trajectory) -> dict[str, Any]:
+    """A recorded episode in a few figures: outcome, time (s), clearances (m), corrections (m/s)."""
+    events = trajectory.events
+    return records.json_safe(
+        {
+            "outcome": trajectory.outcome,
+            "seconds": float(trajectory.worlds.time[-1]),
+            "return": float(events.reward.sum()),
+            "min_pursuer_clearance": float(events.pursuer_clearance.min()),
+            "min_obstacle_clearance": float(events.obstacle_clearance.min()),
+            "intervention_rate": float((trajectory.status != 0).mean()),
+            "infeasible_rate": float((trajectory.status == 2).mean()),
+            "mean_correction": float(trajectory.intervention.mean()),
+        }
+    )
+
+
+def test_scene_of(scenario: Scenario) -> Scenario:
+    """The paper's fixed scene with the constants of `scenario`."""
+    scene = scenario_to_dict(load_scenario("paper-test"))
+    starts = {name: scene[name] for name in ("evader_start", "pursuer_starts", "obstacle_starts", "target_start")}
+    return load_scenario("paper-test", **{**scenario_to_dict(scenario), **starts, "name": "paper-test"})
+
+
+test_scene_of.__test__ = False  # type: ignore[attr-defined]
+
+
+def _quiet(label: str) -> AbstractContextManager[Callable[..., None]]:
+    return nullcontext(lambda *_: None)
+
+
+def _measured(path: Path, run: Callable[[], Evaluation]) -> dict[str, Any]:
+    if not path.exists():
+        records.write_json(path, run().to_dict())
+    return records.read_json(path)
+
+
+def _recorded(path: Path, run: Callable[[], Trajectory]) -> Trajectory:
+    if not path.exists():
+        save_trajectory(path, run())
+    return load_trajectory(path)
+
+
+def reproduce(
+    out: str | Path,
+    *,
+    scenario: Scenario | None = None,
+    shields: Sequence[str] = ("none", "paper", "game"),
+    pursuer: str = "nash",
+    seed: int = 0,
+    episodes: int = 200,
+    evaluation_episodes: int = 1000,
+    options: TrainingOptions | None = None,
+    resume: bool = False,
+    training_progress: Hook = _quiet,
+    count_progress: Hook = _quiet,
+) -> list[ShieldStudy]:
+    """Train under each shield, measure the trained and the untrained policy, run the paper's test scene.
+
+    Writes one run folder per shield in `out`, and `summary.json` with everything side by side. Each part is
+    kept once finished, so `resume` goes on where an interrupted study stopped. Test starts come from
+    another key than training starts.
+
+    **Raises** `RunError` when `out` already holds something and `resume` is not set, or the study in it was
+    begun with other settings; `ValueError` for bad arguments; `KeyboardInterrupt` when interrupted.
+    """
+    scenario = load_scenario("paper") if scenario is None else scenario
+    options = make_options() if options is None else options
+    make_pursuer(pursuer)
+    for shield in shields:
+        make_shield(shield, scenario)
+    if not shields or len(set(shields)) != len(shields):
+        raise ValueError(f"shields = {tuple(shields)!r}: name each shield once, and at least one")
+    out = Path(out)
+    config = {
+        "study": list(shields),
+        "scenario": scenario_to_dict(scenario),
+        "learner": options_to_dict(options),
+        "pursuer": pursuer,
+        "seed": seed,
+        "episodes": episodes,
+        "evaluation_episodes": evaluation_episodes,
+        "version": sidestep.__version__,
+    }
+    if resume and (out / "config.json").exists():
+        if records.open_run(out) != records.json_safe(config):
+            raise records.RunError(f"{out} was begun with other settings; use the same, or another --out")
+    else:
+        records.create_run(out, config)
+
+    scene = test_scene_of(scenario)
+    studies = []
+    for shield in shields:
+        folder = out / shield
+        if not (folder / "policy.npz").exists():
+            begun = (folder / "config.json").exists()
+            with training_progress(shield) as show:
+                training = train(
+                    scenario, shield=shield, pursuer=pursuer, seed=seed, episodes=episodes, options=options,
+                    out=folder, resume=begun, progress=show,
+                )  # fmt: skip
+            if training.interrupted:
+                raise KeyboardInterrupt
+        policy = load_policy(folder)
+
+        def measure(policy: Any, label: str, shield: str = shield) -> Evaluation:
+            with count_progress(f"{shield} shield, {label}") as show:
+                return evaluate(
+                    scenario, policy, shield, pursuer, evaluation_episodes, seed + 1_000_000, progress=show
+                )
+
+        def play(policy: Any, shield: str = shield) -> Trajectory:
+            return rollout(scene, policy, shield, pursuer, seed)
+
+        studies.append(
+            ShieldStudy(
+                shield=shield,
+                folder=folder,
+                training=records.read_summary(folder),
+                trained=_measured(folder / "evaluation.json", lambda p=policy: measure(p, "trained policy")),
+                untrained=_measured(
+                    folder / "evaluation_untrained.json", lambda: measure(GOAL_SEEKING, "goal-seeking policy")
+                ),
+                scene_trained=_recorded(folder / "scene_trained.npz", lambda p=policy: play(p)),
+                scene_untrained=_recorded(folder / "scene_untrained.npz", lambda: play(GOAL_SEEKING)),
+            )
+        )
+    records.write_summary(
+        out, {**config, "paper": PAPER, "shields": {study.shield: study.to_dict() for study in studies}}
+    )
+    return studies
