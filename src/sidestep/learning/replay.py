@@ -61,9 +61,9 @@ class Replay(eqx.Module):
         """An empty ring for transitions shaped like `example`."""
         return cls(
             transitions=jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example),
-            episode=jnp.full((capacity,), -1),
+            episode=jnp.full((capacity,), -1, int),
             episode_last=jnp.zeros((capacity,), int),
-            written=jnp.asarray(0),
+            written=jnp.zeros((), int),
         )
 
     def add(self, transition: Transition, episode: Int[Array, ""], active: Flag) -> Replay:

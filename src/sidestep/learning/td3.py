@@ -52,7 +52,7 @@ class TD3(eqx.Module):
             target_critic=critic,
             actor_moments=optimiser.init(eqx.filter(actor, eqx.is_array)),
             critic_moments=optimiser.init(eqx.filter(critic, eqx.is_array)),
-            updates=jnp.asarray(0),
+            updates=jnp.zeros((), int),
         )
 
 

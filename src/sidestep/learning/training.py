@@ -30,7 +30,7 @@ class Tally(eqx.Module):
 
     @classmethod
     def init(cls) -> Tally:
-        zero, count, far = real(0.0), jnp.asarray(0), real(jnp.inf)
+        zero, count, far = real(0.0), jnp.zeros((), int), real(jnp.inf)
         return cls(zero, count, far, far, count, count, zero)
 
 
@@ -72,17 +72,22 @@ class _Drive(eqx.Module):
     correction: Scalar
 
 
+@eqx.filter_jit
 def start(
     scenario: Scenario, shield: Any, options: TrainingOptions, key: PRNGKeyArray, capacity: int
 ) -> TrainState:
-    """The state before the first decision."""
+    """The state before the first decision.
+
+    Its types are exactly those that `run_chunk` returns: a weakly typed count, say, would make the second
+    chunk compile anew.
+    """
     net_key, reset_key, key = jax.random.split(key, 3)
     world = scenario.reset(reset_key)
     example = Transition(
         world=world,
         next_world=world,
         path=jnp.zeros((options.decision_steps + 1, 2), world.evader.dtype),
-        steps=jnp.asarray(0),
+        steps=jnp.zeros((), int),
         proposed=jnp.zeros_like(world.evader),
         executed=jnp.zeros_like(world.evader),
         correction=real(0.0),
@@ -95,9 +100,9 @@ def start(
         memory=shield.init(world),
         tally=Tally.init(),
         key=key,
-        episodes=jnp.asarray(0),
-        decisions=jnp.asarray(0),
-        env_steps=jnp.asarray(0),
+        episodes=jnp.zeros((), int),
+        decisions=jnp.zeros((), int),
+        env_steps=jnp.zeros((), int),
     )
 
 
