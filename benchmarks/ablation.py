@@ -22,12 +22,12 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "without value bound": ({"bound_values": False}, {}),
     "without small last layer": ({"last_layer_scale": 1.0}, {}),
     "without reward scale": ({"reward_scale": 1.0}, {}),
-    "without any, deciding every 0.5 s": (
-        {"hindsight": 0.0, "mirror": 0.0, "bound_values": False, "last_layer_scale": 1.0, "reward_scale": 1.0},
+    "without any of these": (
+        {"hindsight": 0.0, "mirror": 0.0, "bound_values": False, "last_layer_scale": 1.0, "reward_scale": 1.0,
+         "updates_per_decision": 1},
         {"frame": "world"},
     ),
-    "three updates per decision": ({"updates_per_decision": 3}, {}),
-    "discount 0.98": ({"discount": 0.98}, {}),
+    "without second update per decision": ({"updates_per_decision": 1}, {}),
 }
 """Name, changed training options, changed scenario fields."""
 

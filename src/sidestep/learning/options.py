@@ -41,7 +41,7 @@ class TrainingOptions(eqx.Module):
     replay_action: str = eqx.field(static=True, default="proposed")
     decision_steps: int = eqx.field(static=True, default=10)
     batch_size: int = eqx.field(static=True, default=256)
-    updates_per_decision: int = eqx.field(static=True, default=1)
+    updates_per_decision: int = eqx.field(static=True, default=2)
     warmup_decisions: int = eqx.field(static=True, default=256)
     replay_capacity: int = eqx.field(static=True, default=1_000_000)
 
