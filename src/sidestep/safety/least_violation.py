@@ -5,6 +5,8 @@ violation of a row is v_i(u) = c_i - n_i.u. A *level* is the smallest largest vi
 reach. Rows before `first` are kept as they are; the level is that of the rows from `first` on.
 """
 
+from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -65,19 +67,22 @@ def _disc_level(rows: Rows, first: int) -> Scalar:
     the level is the largest over all triples among the disc and the rows, and each triple has a closed
     form: disc and two rows (`_free_pair`, `_kept_pair`), or three rows (`_triple`).
     """
-    free, kept = part(rows, first), part(rows, 0, first)
-    level = jnp.max(free.c) - 1.0
-    if free.c.shape[0] > 1:
-        level = jnp.maximum(level, jnp.max(_free_pair(_column(free), free)))
-    if first > 0:
-        level = jnp.maximum(level, jnp.max(_kept_pair(_column(kept), free)))
-    if rows.c.shape[0] > 2:
-        level = jnp.maximum(level, jnp.max(_triple(rows, first)))
+    count = rows.c.shape[0]
+    level = jnp.max(rows.c[first:]) - 1.0
+    pairs = list(combinations(range(count), 2))
+    if free := [pair for pair in pairs if pair[0] >= first]:
+        level = jnp.maximum(level, jnp.max(_free_pair(*_take(rows, free))))
+    if mixed := [pair for pair in pairs if pair[0] < first <= pair[1]]:
+        level = jnp.maximum(level, jnp.max(_kept_pair(*_take(rows, mixed))))
+    # At least one of the three is free; the last one, as indices ascend.
+    if triples := [three for three in combinations(range(count), 3) if three[2] >= first]:
+        level = jnp.maximum(level, jnp.max(_triple(*_take(rows, triples), triples, first)))
     return level
 
 
-def _column(rows: Rows) -> Rows:
-    return Rows(rows.x[:, None], rows.y[:, None], rows.c[:, None])
+def _take(rows: Rows, groups: Sequence[tuple[int, ...]]) -> list[Rows]:
+    """The first rows of all groups, the second ones, and so on."""
+    return [Rows(*(entry[index] for entry in rows)) for index in np.array(groups).T]
 
 
 def _free_pair(p: Rows, q: Rows) -> Float[Array, "..."]:
@@ -106,24 +111,25 @@ def _kept_pair(kept: Rows, free: Rows) -> Float[Array, "..."]:
     return jnp.where(along < kept.c, free.c - best, -jnp.inf)
 
 
-def _triple(rows: Rows, first: int) -> Float[Array, "k k k"]:
+def _triple(
+    p: Rows, q: Rows, r: Rows, groups: Sequence[tuple[int, ...]], first: int
+) -> Float[Array, "triples"]:
     """Level of three rows without the disc, by linear duality; -inf where it is unbounded.
 
     With multipliers l >= 0 such that sum l_i n_i = 0 (the cross products of the other two normals) the
     level is sum l_i c_i / (sum of l_i over the free rows). Rounding is subtracted, so that rows which
     can hold are never said not to.
     """
-    n = rows.c.shape[0]
-    eps = float(jnp.finfo(rows.c.dtype).eps)
-    cross = rows.x[:, None] * rows.y[None, :] - rows.y[:, None] * rows.x[None, :]
-    one, two, three = cross[None, :, :], cross.T[:, None, :], cross[:, :, None]
-    free = (np.arange(n) >= first).astype(rows.c.dtype)
-    weight = one * free[:, None, None] + two * free[None, :, None] + three * free[None, None, :]
-    total = one * rows.c[:, None, None] + two * rows.c[None, :, None] + three * rows.c[None, None, :]
-    # An odd order of the three turns all signs, so the other orientation needs no case of its own.
-    inside = (one > 0.0) & (two > 0.0) & (three > 0.0) & (weight > 64.0 * eps)
-    safe = jnp.where(inside, weight, 1.0)
-    return jnp.where(inside, jnp.minimum(total / safe, 4.0) - 32.0 * eps / safe, -jnp.inf)
+    eps = float(jnp.finfo(p.c.dtype).eps)
+    free1, free2, free3 = (first <= np.array(groups).T).astype(p.c.dtype)
+    one, two, three = q.x * r.y - q.y * r.x, r.x * p.y - r.y * p.x, p.x * q.y - p.y * q.x
+    weight = one * free1 + two * free2 + three * free3
+    total = one * p.c + two * q.c + three * r.c
+    positive = (one > 0.0) & (two > 0.0) & (three > 0.0)
+    negative = (one < 0.0) & (two < 0.0) & (three < 0.0)
+    bounded = (positive | negative) & (jnp.abs(weight) > 64.0 * eps)
+    safe = jnp.where(bounded, weight, 1.0)
+    return jnp.where(bounded, jnp.minimum(total / safe, 4.0) - 32.0 * eps / jnp.abs(safe), -jnp.inf)
 
 
 def _circle_level(rows: Rows, first: int) -> Scalar:
@@ -134,7 +140,7 @@ def _circle_level(rows: Rows, first: int) -> Scalar:
     """
     free, kept = part(rows, first), part(rows, 0, first)
     eps = float(jnp.finfo(rows.c.dtype).eps)
-    p = _column(free)
+    p = Rows(free.x[:, None], free.y[:, None], free.c[:, None])
     dx, dy, gap = p.x - free.x, p.y - free.y, p.c - free.c
     squared = dx**2 + dy**2
     meet = (gap**2 <= squared) & (squared > 0.0)
