@@ -23,8 +23,14 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "without small last layer": ({"last_layer_scale": 1.0}, {}),
     "without reward scale": ({"reward_scale": 1.0}, {}),
     "without any of these": (
-        {"hindsight": 0.0, "mirror": 0.0, "bound_values": False, "last_layer_scale": 1.0, "reward_scale": 1.0,
-         "updates_per_decision": 1},
+        {
+            "hindsight": 0.0,
+            "mirror": 0.0,
+            "bound_values": False,
+            "last_layer_scale": 1.0,
+            "reward_scale": 1.0,
+            "updates_per_decision": 1,
+        },
         {"frame": "world"},
     ),
     "without second update per decision": ({"updates_per_decision": 1}, {}),
@@ -32,7 +38,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 """Name, changed training options, changed scenario fields."""
 
 
-def one_training(variant: str, seed: int, episodes: int) -> dict[str, Any]:
+def one_training(variant: str, seed: int, episodes: int, hidden: list[int]) -> dict[str, Any]:
     """Train once on one core and say how it went."""
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     from sidestep.learning import make_options, train
@@ -40,34 +46,42 @@ def one_training(variant: str, seed: int, episodes: int) -> dict[str, Any]:
 
     options, fields = VARIANTS[variant]
     training = train(
-        load_scenario("paper", **fields), shield="game", seed=seed, episodes=episodes, options=make_options(**options)
+        load_scenario("paper", **fields),
+        shield="game",
+        seed=seed,
+        episodes=episodes,
+        options=make_options(**options, hidden=hidden),
     )
     keys = ("episodes", "reached", "captured", "collided", "timed_out", "converged_episode", "final_return",
             "env_steps", "wall_seconds")  # fmt: skip
     return {
         "variant": variant,
         "seed": seed,
+        "hidden": hidden,
         **{key: training.summary[key] for key in keys},
         "outcomes": "".join(line["outcome"][0] for line in training.metrics),
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ablation.json"))
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=80)
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
+    parser.add_argument("--hidden", type=int, nargs="*", default=[256, 256], help="layer widths")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
 
     done: list[dict[str, Any]] = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
-    known = {(run["variant"], run["seed"], run["episodes"]) for run in done}
+    known = {(run["variant"], run["seed"], run["episodes"], tuple(run["hidden"])) for run in done}
     wanted = [
-        (variant, seed, arguments.episodes)
-        for variant in arguments.variants
+        (variant, seed, arguments.episodes, arguments.hidden)
         for seed in range(arguments.seeds)
-        if (variant, seed, arguments.episodes) not in known
+        for variant in arguments.variants
+        if (variant, seed, arguments.episodes, tuple(arguments.hidden)) not in known
     ]
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     # Spawned and never reused, so that every training starts from the same clean process.
@@ -76,9 +90,13 @@ def main() -> None:
         for future in as_completed([pool.submit(one_training, *job) for job in wanted]):
             run = future.result()
             done.append(run)
-            print(f"{run['variant']}, seed {run['seed']}: {run['outcomes']}, converged {run['converged_episode']}")
+            print(
+                f"{run['variant']}, seed {run['seed']}: {run['outcomes']}, converged {run['converged_episode']}"
+            )
             beside = arguments.out.with_suffix(".tmp")
-            beside.write_text(json.dumps(sorted(done, key=lambda r: (r["variant"], r["seed"])), indent=1) + "\n")
+            beside.write_text(
+                json.dumps(sorted(done, key=lambda r: (r["variant"], r["seed"])), indent=1) + "\n"
+            )
             os.replace(beside, arguments.out)
 
 
