@@ -63,6 +63,37 @@ def one_training(variant: str, seed: int, episodes: int, hidden: list[int]) -> d
     }
 
 
+def table(runs: list[dict[str, Any]]) -> str:
+    """Results as a Markdown table, one row per variant."""
+    lines = [
+        "| training | converged by episode (per seed) | reached | collided | timed out |",
+        "|---|---|---|---|---|",
+    ]
+    for variant in VARIANTS:
+        mine = sorted((run for run in runs if run["variant"] == variant), key=lambda run: run["seed"])
+        if not mine:
+            continue
+        episodes = sum(run["episodes"] for run in mine)
+        closed = ", ".join(str(run["converged_episode"] or "never") for run in mine)
+        shares = " | ".join(
+            f"{sum(run[k] for run in mine) / episodes:.0%}" for k in ("reached", "collided", "timed_out")
+        )
+        lines.append(f"| {variant} | {closed} | {shares} |")
+    first = runs[0]
+    seeds = len({run["seed"] for run in runs})
+    return "\n".join(
+        [
+            f"{seeds} seeds each, {first['episodes']} episodes, `game` shield, `nash` pursuer, layers of "
+            f"{' and '.join(map(str, first['hidden']))}. Converged: the first episode that closes 20 with a mean "
+            "return of at least 940, that is at least 19 of 20 reached; *never* means not within these episodes. "
+            "Shares are of all training episodes, the first random ones included.",
+            "",
+            *lines,
+            "",
+        ]
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -73,6 +104,7 @@ def main() -> None:
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     parser.add_argument("--hidden", type=int, nargs="*", default=[256, 256], help="layer widths")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--table", type=Path, help="also write the results as a Markdown table")
     arguments = parser.parse_args()
 
     done: list[dict[str, Any]] = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
@@ -90,14 +122,14 @@ def main() -> None:
         for future in as_completed([pool.submit(one_training, *job) for job in wanted]):
             run = future.result()
             done.append(run)
-            print(
-                f"{run['variant']}, seed {run['seed']}: {run['outcomes']}, converged {run['converged_episode']}"
-            )
+            print(f"{run['variant']}, seed {run['seed']}: {run['outcomes']}, {run['converged_episode']}")
             beside = arguments.out.with_suffix(".tmp")
             beside.write_text(
                 json.dumps(sorted(done, key=lambda r: (r["variant"], r["seed"])), indent=1) + "\n"
             )
             os.replace(beside, arguments.out)
+    if arguments.table is not None:
+        arguments.table.write_text(table(done))
 
 
 if __name__ == "__main__":

@@ -228,7 +228,9 @@ def comparison_table(studies: list[ShieldStudy]) -> Any:
 
     from sidestep.trials.reproduction import PAPER, describe
 
-    table = Table("", "paper reports", *(f"{study.shield} shield" for study in studies), title="The paper and us")
+    table = Table(
+        "", "paper reports", *(f"{study.shield} shield" for study in studies), title="The paper and us"
+    )
 
     def row(label: str, paper: str, values: list[str]) -> None:
         table.add_row(label, paper, *values)
@@ -246,7 +248,11 @@ def comparison_table(studies: list[ShieldStudy]) -> Any:
         str(PAPER["converged_within"]),
         ["never" if t["converged_episode"] is None else str(t["converged_episode"]) for t in trainings],
     )
-    row("  return of the last 20", f"{PAPER['converged_return']:.0f}", [f"{t['final_return']:.0f}" for t in trainings])
+    row(
+        "  return of the last 20",
+        f"{PAPER['converged_return']:.0f}",
+        [f"{t['final_return']:.0f}" for t in trainings],
+    )
     for label, attribute in (("trained policy", "trained"), ("goal-seeking policy", "untrained")):
         results = [getattr(study, attribute) for study in studies]
         row(f"{label}, random starts", "-", [f"{r['episodes']} episodes" for r in results])
@@ -273,7 +279,9 @@ def training_table(summary: dict[str, Any]) -> Any:
     """The figures of one training as a table."""
     from rich.table import Table
 
-    table = Table(title=f"Training, {summary['shield']} shield, {summary['pursuer']} pursuer", show_header=False)
+    table = Table(
+        title=f"Training, {summary['shield']} shield, {summary['pursuer']} pursuer", show_header=False
+    )
     for key in (
         "episodes", "safe_episodes", "captured", "collided", "reached", "timed_out", "converged_episode",
         "final_return", "min_pursuer_clearance", "min_obstacle_clearance", "intervention_rate",
@@ -294,9 +302,7 @@ def evaluation_table(evaluation: Evaluation) -> Any:
     for name in ("captured", "collided", "reached", "timed_out"):
         low, high = figures[f"{name}_rate_low"], figures[f"{name}_rate_high"]
         share = figures[f"{name}_rate"]
-        table.add_row(
-            name.replace("_", " "), str(figures[name]), f"{share:.2%}", f"{low:.2%} to {high:.2%}"
-        )
+        table.add_row(name.replace("_", " "), str(figures[name]), f"{share:.2%}", f"{low:.2%} to {high:.2%}")
     median = figures["reach_time_median"]
     table.caption = (
         f"median time to reach {'-' if median is None else f'{median:.1f} s'}; "

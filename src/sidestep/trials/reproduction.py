@@ -75,7 +75,9 @@ def describe(trajectory: Trajectory) -> dict[str, Any]:
 def test_scene_of(scenario: Scenario) -> Scenario:
     """The paper's fixed scene with the constants of `scenario`."""
     scene = scenario_to_dict(load_scenario("paper-test"))
-    starts = {name: scene[name] for name in ("evader_start", "pursuer_starts", "obstacle_starts", "target_start")}
+    starts = {
+        name: scene[name] for name in ("evader_start", "pursuer_starts", "obstacle_starts", "target_start")
+    }
     return load_scenario("paper-test", **{**scenario_to_dict(scenario), **starts, "name": "paper-test"})
 
 
