@@ -34,14 +34,29 @@ _PUBLIC = {
 }
 _ROOMS = ("world", "pursuit", "safety", "learning", "trials", "views")
 
-__all__ = ["__version__", *_PUBLIC]  # noqa: PLE0604
+__all__ = ["__version__", *_PUBLIC]
 
 if TYPE_CHECKING:
-    from sidestep.learning import LearnedPolicy, load_policy, train
-    from sidestep.pursuit import CaptureGame, Pursuer, make_pursuer
-    from sidestep.safety import Shield, ShieldResult, make_shield
-    from sidestep.trials import Evaluation, Trajectory, evaluate, rollout
-    from sidestep.world import Events, Scenario, ScenarioError, World, goal_seeking, load_scenario, observe
+    from sidestep.learning import LearnedPolicy as LearnedPolicy
+    from sidestep.learning import load_policy as load_policy
+    from sidestep.learning import train as train
+    from sidestep.pursuit import CaptureGame as CaptureGame
+    from sidestep.pursuit import Pursuer as Pursuer
+    from sidestep.pursuit import make_pursuer as make_pursuer
+    from sidestep.safety import Shield as Shield
+    from sidestep.safety import ShieldResult as ShieldResult
+    from sidestep.safety import make_shield as make_shield
+    from sidestep.trials import Evaluation as Evaluation
+    from sidestep.trials import Trajectory as Trajectory
+    from sidestep.trials import evaluate as evaluate
+    from sidestep.trials import rollout as rollout
+    from sidestep.world import Events as Events
+    from sidestep.world import Scenario as Scenario
+    from sidestep.world import ScenarioError as ScenarioError
+    from sidestep.world import World as World
+    from sidestep.world import goal_seeking as goal_seeking
+    from sidestep.world import load_scenario as load_scenario
+    from sidestep.world import observe as observe
 
 
 def __getattr__(name: str) -> Any:

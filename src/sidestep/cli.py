@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import abc
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,7 +36,7 @@ class Train:
     shield: ShieldName = "game"
     """Shield during training: none, paper or game."""
     pursuer: PursuerName = "nash"
-    """Pursuer strategy: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still."""
+    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still."""
     episodes: int = 200
     """Episodes to train for; with --resume the new total."""
     seed: int = 0
@@ -135,6 +137,7 @@ def _write_json(path: Path | None, data: Any) -> None:
 
 
 def train(command: Train, console: Console) -> int:
+    """Run `sidestep train`; returns the exit status."""
     from sidestep.learning import make_options, resume_settings
     from sidestep.learning import train as run_training
     from sidestep.world import load_scenario
@@ -151,8 +154,8 @@ def train(command: Train, console: Console) -> int:
             "episodes": command.episodes,
             "options": make_options(**parse_overrides(command.learner)),
         }
-    with TrainingBar(console, f"training, {settings['shield']} shield") as bar:
-        training = run_training(**settings, out=command.out, resume=command.resume, progress=bar.update)
+    with TrainingBar(console, f"training, {settings['shield']} shield") as show:
+        training = run_training(**settings, out=command.out, resume=command.resume, progress=show)
     console.print(training_table(training.summary))
     _write_json(command.json, training.summary)
     if training.interrupted:
@@ -163,6 +166,7 @@ def train(command: Train, console: Console) -> int:
 
 
 def evaluate(command: Evaluate, console: Console) -> int:
+    """Run `sidestep evaluate`; returns the exit status."""
     from sidestep.learning import load_policy
     from sidestep.learning.records import open_run
     from sidestep.trials import evaluate as run_evaluation
@@ -180,10 +184,10 @@ def evaluate(command: Evaluate, console: Console) -> int:
         scenario = load_scenario(command.scenario or "paper", **overrides)
     shield = command.shield or config.get("shield", "game")
     pursuer = command.pursuer or config.get("pursuer", "nash")
-    with CountBar(console, f"episodes, {shield} shield, {pursuer} pursuer") as bar:
+    with CountBar(console, f"episodes, {shield} shield, {pursuer} pursuer") as show:
         evaluation = run_evaluation(
             scenario, policy, shield, pursuer, command.episodes, command.seed, batch=command.batch,
-            progress=bar.update,
+            progress=show,
         )  # fmt: skip
     console.print(evaluation_table(evaluation))
     about = {"policy": command.run, "shield": shield, "pursuer": pursuer, "scenario": scenario.name}
@@ -192,6 +196,7 @@ def evaluate(command: Evaluate, console: Console) -> int:
 
 
 def reproduce(command: Reproduce, console: Console) -> int:
+    """Run `sidestep reproduce`; returns the exit status."""
     from sidestep.learning import make_options
     from sidestep.learning.records import read_summary
     from sidestep.trials.reproduction import reproduce as run_study
@@ -269,6 +274,7 @@ def comparison_table(studies: list[ShieldStudy]) -> Any:
 
 
 def report(command: Report, console: Console) -> int:
+    """Run `sidestep report`; returns the exit status."""
     from sidestep.views.report import write_report
 
     console.print(f"Report with figures: {write_report(command.runs, command.out)}")
@@ -312,10 +318,11 @@ def evaluation_table(evaluation: Evaluation) -> Any:
     return table
 
 
-class _Bar:
-    """A progress bar on the error stream, so that results alone go to standard output."""
+class _Bar(abc.ABC):
+    """A progress bar on the error stream, so that results alone go to standard output.
 
-    columns: tuple[Any, ...] = ()
+    A context manager that gives its `update`.
+    """
 
     def __init__(self, console: Console, label: str):
         from rich.console import Console as RichConsole
@@ -331,9 +338,13 @@ class _Bar:
         )
         self._task = self._progress.add_task(label, total=None, note="compiling")
 
-    def __enter__(self):
+    def __enter__(self) -> Callable[..., None]:
         self._progress.__enter__()
-        return self
+        return self.update
+
+    @abc.abstractmethod
+    def update(self, *values: Any) -> None:
+        """Show where the work is."""
 
     def __exit__(self, *error: Any) -> None:
         self._progress.__exit__(*error)
@@ -342,7 +353,8 @@ class _Bar:
 class TrainingBar(_Bar):
     """Episode, steps per second, mean return of the last 20 episodes, safe count."""
 
-    def update(self, progress: Progress) -> None:
+    def update(self, *values: Any) -> None:
+        progress: Progress = values[0]
         note = f"{progress.steps_per_second:,.0f} steps/s  safe {progress.safe}"
         if progress.last is not None:
             note += f"  return {progress.last['return']:.0f} (mean of 20: {progress.mean_return:.0f})"
@@ -352,7 +364,8 @@ class TrainingBar(_Bar):
 class CountBar(_Bar):
     """Finished of all."""
 
-    def update(self, finished: int, total: int) -> None:
+    def update(self, *values: Any) -> None:
+        finished, total = values
         self._progress.update(self._task, total=total, completed=finished, note="")
 
 

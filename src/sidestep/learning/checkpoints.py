@@ -70,7 +70,8 @@ def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, *
               for name, leaf in _named_leaves(tree)}  # fmt: skip
     manifest = json.dumps({**about, "digest": _digest(arrays), "rows": rows})
     buffer = io.BytesIO()
-    np.savez(buffer, **{_MANIFEST: np.frombuffer(manifest.encode(), np.uint8)}, **_slots(arrays))
+    stored: dict[str, Any] = {_MANIFEST: np.frombuffer(manifest.encode(), np.uint8), **_slots(arrays)}
+    np.savez(buffer, **stored)
     write_bytes(path, buffer.getvalue())
 
 
@@ -90,9 +91,9 @@ def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except FileNotFoundError:
         raise CheckpointError(f"{path} does not exist") from None
     except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); remove it to fall back on the one before it") from None
+        raise CheckpointError(f"{path} is damaged: {error}") from None
     if _digest(arrays) != manifest.get("digest"):
-        raise CheckpointError(f"{path} is damaged (its digest differs); remove it to fall back on the one before it")
+        raise CheckpointError(f"{path} is damaged: its digest differs from its content's")
     return arrays, manifest
 
 
@@ -106,17 +107,22 @@ def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
     for name, leaf in _named_leaves(example):
         wanted = _plain(leaf)
         if name not in arrays:
-            raise CheckpointError(f"{path} lacks {name}: it was written by another version or with other options")
+            raise CheckpointError(
+                f"{path} lacks {name}: it was written by another version or with other options"
+            )
         array = arrays.pop(name)
         if _rows_of(name, manifest["rows"]) is not None and array.shape[1:] == wanted.shape[1:]:
             array = np.concatenate([array, wanted[len(array) :]])
         if array.shape != wanted.shape or array.dtype != wanted.dtype:
             raise CheckpointError(
-                f"{path}: {name} is {array.dtype}{list(array.shape)}, but {wanted.dtype}{list(wanted.shape)} is "
-                "needed: it was written with another scenario, other options or another float precision"
+                f"{path}: {name} is {array.dtype}{list(array.shape)}, but {wanted.dtype}"
+                f"{list(wanted.shape)} is needed: it was written with another scenario, other options or "
+                "another float precision"
             )
         value = jnp.asarray(array)
-        leaves.append(jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else value)
+        if _is_key(leaf):
+            value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
+        leaves.append(value)
     if arrays:
         raise CheckpointError(f"{path} holds {', '.join(list(arrays)[:3])} that this version does not know")
     return jax.tree.unflatten(jax.tree.structure(example), leaves), manifest

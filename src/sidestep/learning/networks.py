@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray
+from sidestep._arrays import AnyArray, real
 
 
 class Perceptron(eqx.Module):
@@ -24,18 +26,21 @@ class Perceptron(eqx.Module):
     def __init__(self, sizes: tuple[int, ...], key: PRNGKeyArray, last_scale: float = 1.0):
         self.weights, self.biases = [], []
         last = len(sizes) - 2
-        for layer, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for layer, (inputs, outputs) in enumerate(pairwise(sizes)):
             key, weight_key, bias_key = jax.random.split(key, 3)
             bound = inputs**-0.5 * (last_scale if layer == last else 1.0)
             self.weights.append(
                 jax.random.uniform(weight_key, (inputs, outputs), dtype=float, minval=-bound, maxval=bound)
             )
-            self.biases.append(jax.random.uniform(bias_key, (outputs,), dtype=float, minval=-bound, maxval=bound))
+            self.biases.append(
+                jax.random.uniform(bias_key, (outputs,), dtype=float, minval=-bound, maxval=bound)
+            )
 
     def __call__(self, batch: Float[AnyArray, "batch inputs"]) -> Float[Array, "batch outputs"]:
+        layer = real(batch)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            batch = jax.nn.relu(batch @ weight + bias)
-        return batch @ self.weights[-1] + self.biases[-1]
+            layer = jax.nn.relu(layer @ weight + bias)
+        return layer @ self.weights[-1] + self.biases[-1]
 
 
 class Actor(eqx.Module):
@@ -44,7 +49,12 @@ class Actor(eqx.Module):
     body: Perceptron
 
     def __init__(
-        self, observations: int, actions: int, hidden: tuple[int, ...], key: PRNGKeyArray, last_scale: float = 1.0
+        self,
+        observations: int,
+        actions: int,
+        hidden: tuple[int, ...],
+        key: PRNGKeyArray,
+        last_scale: float = 1.0,
     ):
         self.body = Perceptron((observations, *hidden, actions), key, last_scale)
 

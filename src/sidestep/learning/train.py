@@ -87,7 +87,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
 
 
 def resume_settings(folder: str | Path) -> dict[str, Any]:
-    """What `train` needs to continue a run as it was begun: scenario, shield, pursuer, seed, options, episodes.
+    """What `train` needs to continue a run as it was begun: scenario, shield, pursuer, seed and the like.
 
     **Raises** `RunError` when `folder` holds no run.
     """
@@ -184,7 +184,9 @@ def train(
                     write_checkpoint(folder, state, wall_seconds=earlier + now - begun)
                     saved = now
             if progress is not None:
-                steps, seconds = (sum(column) for column in zip(*chunk_seconds[-20:], strict=True))
+                # The first chunk compiles; it tells the rate only while there is no other.
+                recent = chunk_seconds[1:][-20:] or chunk_seconds
+                steps, seconds = (sum(column) for column in zip(*recent, strict=True))
                 progress(_progress(metrics, state, episodes, steps / seconds))
     except KeyboardInterrupt:
         interrupted = True
@@ -213,7 +215,8 @@ def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tup
             )
     if config["episodes"] < stored["episodes"]:
         raise records.RunError(
-            f"{folder} was begun for {stored['episodes']} episodes; it cannot be resumed for {config['episodes']}"
+            f"{folder} was begun for {stored['episodes']} episodes; it cannot be resumed for fewer "
+            f"({config['episodes']})"
         )
     state, manifest = read_checkpoint(folder, example)
     records.truncate_metrics(folder, int(state.episodes))
@@ -232,4 +235,3 @@ def _progress(metrics: list[dict[str, Any]], state: TrainState, episodes: int, r
         mean_return=float(np.mean(recent)) if recent else float("nan"),
         last=metrics[-1] if metrics else None,
     )
-

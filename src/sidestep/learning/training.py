@@ -17,6 +17,7 @@ from sidestep.learning.td3 import Learner, Losses, update
 from sidestep.safety.status import Status
 from sidestep.world import Scenario, World, observation_size, observe, to_action, to_velocity
 
+
 class Tally(eqx.Module):
     """What one episode has come to so far. Clearances in m, correction in m/s summed over periods."""
 
@@ -160,7 +161,12 @@ def _drive(
 
 
 def _learn(
-    scenario: Scenario, shield: Any, options: TrainingOptions, learner: Learner, replay: Replay, key: PRNGKeyArray
+    scenario: Scenario,
+    shield: Any,
+    options: TrainingOptions,
+    learner: Learner,
+    replay: Replay,
+    key: PRNGKeyArray,
 ) -> tuple[Learner, Losses]:
     def one(learner: Learner, key: PRNGKeyArray) -> tuple[Learner, Losses]:
         sample_key, update_key = jax.random.split(key)
@@ -263,7 +269,9 @@ def decide_and_learn(
         (learner, replay),
         is_leaf=lambda leaf: leaf is None,
     )
-    report = Report(ended=ended & active, outcome=end.outcome, tally=end.tally, env_steps=env_steps, losses=losses)
+    report = Report(
+        ended=ended & active, outcome=end.outcome, tally=end.tally, env_steps=env_steps, losses=losses
+    )
     return state, report
 
 

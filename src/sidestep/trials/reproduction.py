@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import sidestep
-from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, train
-from sidestep.learning import records
+from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield
 from sidestep.trials.evaluation import Evaluation
