@@ -53,7 +53,7 @@ check: $(READY) ## Format, lint, import order, types, documentation, lock
 	$(PY) -m ruff check .
 	$(VENV)/bin/lint-imports
 	$(PY) -m pyright
-	$(PY) -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
 	@if grep -nE '://|--(extra-)?index-url|--find-links' requirements.lock; then \
 	  echo "requirements.lock must hold no addresses: write it with 'make lock'" >&2; exit 1; \
 	fi
@@ -68,7 +68,7 @@ lock: ## Write requirements.lock anew after a change of dependencies (make lock 
 	  -o requirements.lock $(ARGS)
 
 docs: $(READY) ## Build the documentation into site/
-	$(PY) -m mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
 bench: $(BENCH_READY) ## Time the training loop against Stable-Baselines3
 	$(BENCH_PY) benchmarks/learning.py $(ARGS)
