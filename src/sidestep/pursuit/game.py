@@ -13,10 +13,12 @@ so that the best the pursuer can do, with |v| + b |omega| <= V, is n.z' = n.u - 
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep.pursuit.time_optimal import Play, time_optimal_play
 from sidestep.world.capture_geometry import capture_set_distance, usable_angle
 from sidestep.world.scenario import Scenario
 
@@ -27,7 +29,7 @@ def _sign(value: Float[AnyArray, ""]) -> Scalar:
 
 
 def turning_moment(z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
-    """sigma = n_x z_y - n_y z_x (m): moment of n about the pursuer, so that turning adds omega sigma to n.z'."""
+    """sigma = n_x z_y - n_y z_x (m): the moment of n about the pursuer; turning adds omega sigma to n.z'."""
     return normal[0] * z[1] - normal[1] * z[0]
 
 
@@ -136,6 +138,55 @@ class CaptureGame(eqx.Module):
         turn = _sign(turning_moment(z, normal)) * jnp.array([1.0, -1.0], z.dtype)
         return self.pursuer_speed * jnp.where(straight, forward, turn)
 
+    def play(self, z: Float[AnyArray, "2"]) -> Play:
+        """Optimal play in the game of time at z: see `Play`. Carries no derivatives."""
+        return time_optimal_play(
+            real(z),
+            self.evader_speed,
+            self.pursuer_speed,
+            self.half_axle,
+            self.capture_distance,
+            self.evader_can_escape,
+        )
+
+    def time_to_capture(self, z: Float[AnyArray, "2"]) -> Scalar:
+        """Time to capture (s) under optimal play: 0 within l, infinite where capture cannot be forced.
+
+        It jumps across the capture set's sides. Differentiable in z, where Isaacs' equation gives the
+        gradient; the game's constants are held, and so are second derivatives.
+        """
+        return _time_to_capture(real(z), jax.lax.stop_gradient(self))
+
+    def evader_saddle(self, z: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+        """Direction (unit vector, pursuer's frame) in which the evader flees at z when both play well.
+
+        In the game of time where capture can be forced, else along the barrier's normal.
+        """
+        play = self.play(z)
+        return jnp.where(jnp.isfinite(play.time), play.direction, self.barrier(z)[1])
+
     def pursuer_saddle(self, z: Float[AnyArray, "2"]) -> Float[Array, "2"]:
-        """Wheel speeds (left, right; m/s) of the pursuer's saddle-point law at z."""
-        return self.steer_against(z, self.barrier(z)[1])
+        """Wheel speeds (left, right; m/s) of the pursuer's saddle-point law at z.
+
+        In the game of time where capture can be forced, else against the barrier's normal.
+        """
+        z = real(z)
+        return self.steer_against(z, self.evader_saddle(z))
+
+
+@jax.custom_jvp
+def _time_to_capture(z: Float[Array, "2"], game: CaptureGame) -> Scalar:
+    return game.play(z).time
+
+
+@_time_to_capture.defjvp
+def _time_to_capture_jvp(
+    primals: tuple[Float[Array, "2"], CaptureGame], tangents: tuple[Float[Array, "2"], CaptureGame]
+) -> tuple[Scalar, Scalar]:
+    """grad T = n / (V max(|n_x|, |sigma|/b) - v_e), since the time runs down at rate 1."""
+    (z, game), (z_dot, _) = primals, tangents
+    play = game.play(z)
+    closing = game.pursuit_rate(z, play.direction) - game.evader_speed
+    running = jnp.isfinite(play.time) & (play.time > 0.0) & (closing > 0.0)
+    slope = jnp.sum(play.direction * z_dot) / jnp.where(running, closing, 1.0)
+    return play.time, jnp.where(running, slope, 0.0)

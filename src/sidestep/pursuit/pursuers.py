@@ -54,24 +54,51 @@ def _toward(
 class Nash(Pursuer):
     """The saddle point of the capture game: no pursuer does better against an evader that plays well.
 
-    Where capture is possible it plays the time-optimal game. Where it is not, "Nash" in capture time
-    means nothing (every choice takes forever), so it plays for the smallest distance: from farther out it
-    turns its nearer end to the evader and drives, which brings it to the stand-off at b cot S; there,
-    within h_max of the capture set, it drives straight, which forces the distance down to l_max and no
-    lower. Beside the usable part, where driving on would only pass the evader by, it turns again.
+    Where capture is possible it plays the game of time. Where it is not, "Nash" in capture time means
+    nothing (every choice takes forever), so it plays for the smallest distance: from farther out it turns
+    its nearer end to the evader and drives, which brings it to the stand-off at b cot S; there, within
+    h_max of the capture set, it drives straight, which forces the distance down to l_max and no lower.
+    Beside the usable part, where driving on would only pass the evader by, it turns again.
     """
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(world.evader, world.pursuer)
-        value, normal = game.barrier(z)
-        end, turn = nearer_end(bearing_of(z))
-        closing = _toward(scenario, turn, end)
-        # The stand-off is only reached in infinite time; one period's driving away is near enough to strike.
-        reach = scenario.pursuer_speed * scenario.control_period
-        near = value <= jnp.maximum(game.largest_capture_distance - scenario.capture_distance, 0.0) + reach
-        strike = near & (jnp.abs(turn) <= game.usable_angle)
-        return jnp.where(strike, game.steer_against(z, normal), closing)
+        capturable = ~game.evader_can_escape | (game.barrier(z)[0] <= 0.0)
+        # A cond, so that where no scenario is capturable the game of time costs nothing.
+        return jax.lax.cond(
+            capturable,
+            lambda: _hasten(game, z, scenario.control_period),
+            lambda: _approach(scenario, game, z),
+        )
+
+
+def _hasten(game: CaptureGame, z: Float[Array, "2"], period: Scalar) -> Float[Array, "2"]:
+    """The time-optimal law, sampled: each phase of the play gets its share of the control period.
+
+    It never turns past the evader. The play would, by as much as the evader runs on meanwhile, but near the
+    axis an evader that reverses every period could then keep a pursuer busy turning to and fro for ever.
+    """
+    play = game.play(z)
+    to_face = game.half_axle / game.pursuer_speed * jnp.arctan2(jnp.abs(z[1]), jnp.abs(z[0]))
+    backing = jnp.clip(play.backing / period, 0.0, 1.0)
+    turning = jnp.clip(jnp.minimum(play.turning, to_face) / period, 0.0, 1.0 - backing)
+    driving = 1.0 - backing - turning
+    ahead, left = jnp.where(z < 0.0, -1.0, 1.0).astype(z.dtype)
+    straight = ahead * (driving - backing)
+    turn = ahead * left * turning
+    return game.pursuer_speed * jnp.stack([straight - turn, straight + turn])
+
+
+def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2"]) -> Float[Array, "2"]:
+    """The law for the smallest distance: face or back onto the evader, come close, and strike."""
+    end, turn = nearer_end(bearing_of(z))
+    # The stand-off is only reached in infinite time; one period's driving away is near enough to strike.
+    reach = scenario.pursuer_speed * scenario.control_period
+    strikes_from = game.largest_capture_distance - game.capture_distance + reach
+    strike = (game.barrier(z)[0] <= strikes_from) & (jnp.abs(turn) <= game.usable_angle)
+    straight = jnp.full(2, end * game.pursuer_speed)
+    return jnp.where(strike, straight, _toward(scenario, turn, end))
 
 
 @final
