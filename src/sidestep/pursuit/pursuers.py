@@ -64,12 +64,11 @@ class Nash(Pursuer):
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(world.evader, world.pursuer)
-        capturable = ~game.evader_can_escape | (game.barrier(z)[0] <= 0.0)
-        # A cond, so that where no scenario is capturable the game of time costs nothing.
+        # The condition is the scenario's, not the world's, so a batch of worlds takes one branch only.
         return jax.lax.cond(
-            capturable,
-            lambda: _hasten(game, z, scenario.control_period),
+            game.evader_can_escape,
             lambda: _approach(scenario, game, z),
+            lambda: _hasten(game, z, scenario.control_period),
         )
 
 
@@ -91,7 +90,10 @@ def _hasten(game: CaptureGame, z: Float[Array, "2"], period: Scalar) -> Float[Ar
 
 
 def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2"]) -> Float[Array, "2"]:
-    """The law for the smallest distance: face or back onto the evader, come close, and strike."""
+    """The law for the smallest distance: face or back onto the evader, come close, and strike.
+
+    It strikes inside the capture set too, where driving straight on is also what captures soonest.
+    """
     end, turn = nearer_end(bearing_of(z))
     # The stand-off is only reached in infinite time; one period's driving away is near enough to strike.
     reach = scenario.pursuer_speed * scenario.control_period
