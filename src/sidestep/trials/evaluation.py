@@ -1,0 +1,139 @@
+"""What a batch of episodes came to: counts, rates with intervals, clearances, interventions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sidestep.learning.records import OUTCOMES, json_safe
+from sidestep.trials.statistics import wilson_interval
+
+_QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Results of `evaluate`, one entry per episode, in the order of the episodes' numbers.
+
+    **Attributes:** `outcome` indices into `OUTCOMES`; `returns` undiscounted; `steps` control periods;
+    `times` s; `min_pursuer_clearance` and `min_obstacle_clearance` m, infinite without such a robot;
+    `interventions`, `infeasible`, `invalid` control periods in which the shield did not answer with the
+    nominal action, could not satisfy its rows, was given numbers that are not finite; `mean_correction`
+    over all periods and `max_correction`, m/s.
+    """
+
+    outcome: Int[np.ndarray, "episodes"]
+    returns: Float[np.ndarray, "episodes"]
+    steps: Int[np.ndarray, "episodes"]
+    times: Float[np.ndarray, "episodes"]
+    min_pursuer_clearance: Float[np.ndarray, "episodes"]
+    min_obstacle_clearance: Float[np.ndarray, "episodes"]
+    interventions: Int[np.ndarray, "episodes"]
+    infeasible: Int[np.ndarray, "episodes"]
+    invalid: Int[np.ndarray, "episodes"]
+    mean_correction: Float[np.ndarray, "episodes"]
+    max_correction: Float[np.ndarray, "episodes"]
+
+    def numbers_of(self, outcome: str) -> Int[np.ndarray, "some"]:
+        """Numbers of the episodes with this outcome; `rollout` with `episode_key` replays them."""
+        return np.flatnonzero(self.outcome == OUTCOMES.index(outcome))
+
+    def _count(self, outcome: str) -> int:
+        return len(self.numbers_of(outcome))
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.outcome)
+
+    @property
+    def captured(self) -> int:
+        """Episodes that ended with a capture, whether or not it came with a collision."""
+        return self._count("captured")
+
+    @property
+    def collided(self) -> int:
+        """Episodes that ended with a collision and no capture."""
+        return self._count("collided")
+
+    @property
+    def reached(self) -> int:
+        """Episodes that ended at the target, neither captured nor collided."""
+        return self._count("reached")
+
+    @property
+    def timed_out(self) -> int:
+        """Episodes cut by the time limit, with nothing else having happened."""
+        return self._count("timed_out")
+
+    @property
+    def safe(self) -> int:
+        """Episodes without capture or collision."""
+        return self.episodes - self.captured - self.collided
+
+    @property
+    def reach_time_median(self) -> float | None:
+        """Median time (s) of the episodes that reached the target; None if none did."""
+        times = self.times[self.numbers_of("reached")]
+        return float(np.median(times)) if len(times) else None
+
+    def _share(self, periods: Int[np.ndarray, "episodes"]) -> float:
+        return float(periods.sum() / self.steps.sum())
+
+    @property
+    def intervention_rate(self) -> float:
+        """Share of control periods in which the shield did not answer with the nominal action."""
+        return self._share(self.interventions)
+
+    @property
+    def infeasible_rate(self) -> float:
+        """Share of control periods in which the shield could not satisfy its rows."""
+        return self._share(self.infeasible)
+
+    @property
+    def invalid_rate(self) -> float:
+        """Share of control periods in which the policy asked for something that is not finite."""
+        return self._share(self.invalid)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values: counts, `X_rate` with its 95 % Wilson interval `X_rate_low`, `X_rate_high` for
+        X in captured, collided, reached, timed_out and safe, and what else the attributes sum up to.
+
+        Clearances of robots that do not exist, and the median time of no episode, are null.
+        """
+        counts = {name: self._count(name) for name in OUTCOMES} | {"safe": self.safe}
+        report: dict[str, Any] = {"episodes": self.episodes, **counts}
+        for name, count in counts.items():
+            low, high = wilson_interval(count, self.episodes)
+            report |= {
+                f"{name}_rate": count / self.episodes,
+                f"{name}_rate_low": low,
+                f"{name}_rate_high": high,
+            }
+
+        def quantiles(values: np.ndarray) -> dict[str, float]:
+            # Among infinite values (no such robot) interpolation would subtract infinities.
+            if not np.all(np.isfinite(values)):
+                return {f"{q:g}": np.inf for q in _QUANTILES}
+            return {
+                f"{q:g}": float(v) for q, v in zip(_QUANTILES, np.quantile(values, _QUANTILES), strict=True)
+            }
+
+        report |= {
+            "reach_time_median": self.reach_time_median,
+            "mean_return": float(np.mean(self.returns)),
+            "env_steps": int(self.steps.sum()),
+            "min_pursuer_clearance": float(np.min(self.min_pursuer_clearance)),
+            "min_obstacle_clearance": float(np.min(self.min_obstacle_clearance)),
+            "pursuer_clearance_quantiles": quantiles(self.min_pursuer_clearance),
+            "obstacle_clearance_quantiles": quantiles(self.min_obstacle_clearance),
+            "intervention_rate": self.intervention_rate,
+            "infeasible_rate": self.infeasible_rate,
+            "invalid_rate": self.invalid_rate,
+            "mean_correction": float(np.sum(self.mean_correction * self.steps) / np.sum(self.steps)),
+            "max_correction": float(np.max(self.max_correction)),
+        }
+        return json_safe(report)

@@ -1,0 +1,23 @@
+"""Which random key each episode of a trial uses, so that any of them can be run again alone."""
+
+import operator
+
+import jax
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+
+def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
+    """A random key from a key or a seed."""
+    return jax.random.key(operator.index(key)) if isinstance(key, (int, np.integer)) else key
+
+
+def episode_key(key: PRNGKeyArray | int, number: int | Int[Array, ""]) -> PRNGKeyArray:
+    """The key of episode `number` of an evaluation with `key`: `rollout` with it runs that episode again."""
+    return jax.random.fold_in(as_key(key), number)
+
+
+def start_and_pursuit(key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArray]:
+    """Keys of one episode's start and of its pursuers, which fold in the number of the control period."""
+    start_key, pursuit_key = jax.random.split(key)
+    return start_key, pursuit_key

@@ -1,0 +1,249 @@
+"""Batched Monte Carlo: many episodes of any policy, shield and pursuer at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from sidestep._arrays import Count, Scalar, real
+from sidestep.learning.control_step import control_step, decide, decision_steps_of
+from sidestep.pursuit import as_pursuer
+from sidestep.safety import Shield, Status, as_shield
+from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.keys import as_key, episode_key, start_and_pursuit
+from sidestep.trials.policies import as_policy
+from sidestep.world import Events, Scenario, World
+
+RUNNING = -1
+_CHUNK_STEPS = 200
+
+
+class Episode(eqx.Module):
+    """One episode on its way: where it is and what it has come to. `outcome` is -1 while it runs."""
+
+    number: Count
+    outcome: Count
+    world: World
+    memory: Any
+    steps: Count
+    total_reward: Scalar
+    pursuer_clearance: Scalar
+    obstacle_clearance: Scalar
+    interventions: Count
+    infeasible: Count
+    invalid: Count
+    correction: Scalar
+    max_correction: Scalar
+
+
+def outcome_of(events: Events) -> Int[Array, ""]:
+    """Index into `OUTCOMES` of what ended the episode in this period, -1 if nothing did."""
+    flags = jnp.stack([events.captured, events.collided, events.reached, events.timed_out])
+    return jnp.where(jnp.any(flags), jnp.argmax(flags), RUNNING).astype(jnp.int32)
+
+
+@eqx.filter_jit
+def _starts(scenario: Scenario, key: PRNGKeyArray, numbers: Int[Array, "batch"]) -> World:
+    """The worlds in which these episodes start."""
+    return jax.vmap(lambda number: scenario.reset(start_and_pursuit(episode_key(key, number))[0]))(numbers)
+
+
+def _begin(shield: Any, number: Count, world: World) -> Episode:
+    none, zero, far = jnp.zeros((), jnp.int32), real(0.0), real(jnp.inf)
+    return Episode(
+        number=number,
+        outcome=jnp.full((), RUNNING, jnp.int32),
+        world=world,
+        memory=shield.init(world),
+        steps=none,
+        total_reward=zero,
+        pursuer_clearance=far,
+        obstacle_clearance=far,
+        interventions=none,
+        infeasible=none,
+        invalid=none,
+        correction=zero,
+        max_correction=zero,
+    )
+
+
+@eqx.filter_jit
+def _refill(shield: Any, slots: Episode, numbers: Int[Array, "batch"], worlds: World) -> Episode:
+    """Slot i becomes episode `numbers[i]` at its start, unless that is negative."""
+    fresh = jax.vmap(lambda number, world: _begin(shield, number, world))(numbers, worlds)
+    return _select(numbers >= 0, fresh, slots)
+
+
+def _empty_slots(shield: Any, worlds: World, size: int) -> Episode:
+    """Slots in which nothing runs."""
+    numbers = jnp.full(size, RUNNING, jnp.int32)
+    shapes = eqx.filter_eval_shape(jax.vmap(lambda n, w: _begin(shield, n, w)), numbers, worlds)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+def _select(flags: Array, if_true: Any, if_false: Any) -> Any:
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(flags.reshape(flags.shape + (1,) * (a.ndim - flags.ndim)), a, b)
+
+    return jax.tree.map(pick, if_true, if_false)
+
+
+@eqx.filter_jit
+def _advance(
+    scenario: Scenario,
+    policy: Callable[..., Any],
+    shield: Any,
+    pursuer: Callable[..., Any],
+    key: PRNGKeyArray,
+    episodes: Episode,
+    decisions: Count,
+) -> Episode:
+    """Every running episode by up to `decisions` decisions; stops early when none is running."""
+
+    def period(episode: Episode, nominal: Array) -> Episode:
+        _, pursuit_key = start_and_pursuit(episode_key(key, episode.number))
+        step_key = jax.random.fold_in(pursuit_key, episode.steps)
+        world, memory, events, result, _ = control_step(
+            scenario, shield, pursuer, episode.world, episode.memory, nominal, step_key
+        )
+        moved = Episode(
+            number=episode.number,
+            outcome=outcome_of(events),
+            world=world,
+            memory=memory,
+            steps=episode.steps + 1,
+            total_reward=episode.total_reward + events.reward,
+            pursuer_clearance=jnp.minimum(episode.pursuer_clearance, events.pursuer_clearance),
+            obstacle_clearance=jnp.minimum(episode.obstacle_clearance, events.obstacle_clearance),
+            interventions=episode.interventions + (result.status != Status.OK).astype(jnp.int32),
+            infeasible=episode.infeasible + (result.status == Status.INFEASIBLE).astype(jnp.int32),
+            invalid=episode.invalid + (result.status == Status.INVALID).astype(jnp.int32),
+            correction=episode.correction + result.intervention,
+            max_correction=jnp.maximum(episode.max_correction, result.intervention),
+        )
+        return _select(episode.outcome == RUNNING, moved, episode)
+
+    def decision(episode: Episode) -> Episode:
+        nominal = decide(scenario, policy, episode.world)
+        hold = lambda episode, _: (period(episode, nominal), None)  # noqa: E731
+        return jax.lax.scan(hold, episode, None, length=decision_steps_of(policy))[0]
+
+    def more(carry: tuple[Count, Episode]) -> Array:
+        return (carry[0] < decisions) & jnp.any(carry[1].outcome == RUNNING)
+
+    def advance(carry: tuple[Count, Episode]) -> tuple[Count, Episode]:
+        return carry[0] + 1, jax.vmap(decision)(carry[1])
+
+    return jax.lax.while_loop(more, advance, (jnp.zeros((), jnp.int32), episodes))[1]
+
+
+def _positive(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} = {value!r}: it must be a whole number of at least 1")
+    return int(value)
+
+
+def evaluate(
+    scenario: Scenario,
+    policy: str | Callable[..., Any],
+    shield: str | Shield,
+    pursuer: str | Callable[..., Any],
+    episodes: int,
+    key: PRNGKeyArray | int,
+    *,
+    batch: int = 256,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Run `episodes` independent episodes to their ends and report what happened.
+
+    Episode i draws all its random numbers from `fold_in(key, i)`: neither `batch` nor the number of
+    episodes changes them (rounding may differ in the last digit between batch sizes).
+
+    **Arguments:**
+
+    - `policy` any `(observation) -> action in [-1, 1]^2`, in JAX or not, or `"goal-seeking"`; asked every
+      `policy.decision_steps` control periods (1 if it has none)
+    - `shield` a name or a `Shield`; `pursuer` a name, a `Pursuer` or a callable
+      `(scenario, world, key) -> wheel speeds (2,)`
+    - `key` a random key or a seed
+    - `batch` episodes that run at once; `progress(finished, episodes)` is called between chunks
+
+    **Raises** `ValueError` for a number that is not positive, for an unknown name and for an answer of the
+    wrong shape. An action that is not finite is passed on to the shield and counted as `invalid`.
+    """
+    episodes, batch = _positive("episodes", episodes), _positive("batch", batch)
+    key = as_key(key)
+    policy = as_policy(policy, scenario)
+    shield = as_shield(shield, scenario)
+    pursuer = as_pursuer(pursuer)
+    decisions = jnp.asarray(max(1, _CHUNK_STEPS // decision_steps_of(policy)), jnp.int32)
+
+    # One width for every number of episodes, slots refilled as they fall free: each width would compile
+    # anew, which takes longer than ten thousand episodes.
+    numbers = np.full(batch, RUNNING, np.int32)
+    slots: Episode | None = None
+    results: dict[str, np.ndarray] = {}
+    begun = finished = 0
+    while finished < episodes:
+        free = np.flatnonzero(numbers < 0)[: episodes - begun]
+        if len(free):
+            fresh = np.full(batch, RUNNING, np.int32)
+            fresh[free] = np.arange(begun, begun + len(free))
+            worlds = _starts(scenario, key, jnp.asarray(np.maximum(fresh, 0)))
+            slots = _refill(shield, slots or _empty_slots(shield, worlds, batch), jnp.asarray(fresh), worlds)
+            numbers[free] = fresh[free]
+            begun += len(free)
+        assert slots is not None
+        slots = _advance(scenario, policy, shield, pursuer, key, slots, decisions)
+        ended = np.flatnonzero((np.asarray(slots.outcome) != RUNNING) & (numbers >= 0))
+        _collect(results, slots, ended, numbers[ended], episodes)
+        numbers[ended] = RUNNING
+        finished += len(ended)
+        if progress is not None:
+            progress(finished, episodes)
+    return _evaluation(scenario, results)
+
+
+_COLLECTED = (
+    "outcome",
+    "total_reward",
+    "steps",
+    "pursuer_clearance",
+    "obstacle_clearance",
+    "interventions",
+    "infeasible",
+    "invalid",
+    "correction",
+    "max_correction",
+)
+
+
+def _collect(
+    results: dict[str, np.ndarray], slots: Episode, ended: np.ndarray, numbers: np.ndarray, episodes: int
+) -> None:
+    for name in _COLLECTED:
+        values = np.asarray(getattr(slots, name))
+        results.setdefault(name, np.zeros(episodes, values.dtype))[numbers] = values[ended]
+
+
+def _evaluation(scenario: Scenario, results: dict[str, np.ndarray]) -> Evaluation:
+    steps = results["steps"]
+    return Evaluation(
+        outcome=results["outcome"],
+        returns=results["total_reward"],
+        steps=steps,
+        times=steps * np.asarray(scenario.control_period, dtype=float),
+        min_pursuer_clearance=results["pursuer_clearance"],
+        min_obstacle_clearance=results["obstacle_clearance"],
+        interventions=results["interventions"],
+        infeasible=results["infeasible"],
+        invalid=results["invalid"],
+        mean_correction=results["correction"] / steps,
+        max_correction=results["max_correction"],
+    )
