@@ -12,15 +12,14 @@ import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, Scalar, real
-from sidestep.learning.control_step import control_step, decide, decision_steps_of
+from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, Status, as_shield
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.keys import as_key, episode_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
-from sidestep.world import Events, Scenario, World
+from sidestep.world import Scenario, World
 
-RUNNING = -1
 _CHUNK_STEPS = 200
 
 
@@ -40,12 +39,6 @@ class Episode(eqx.Module):
     invalid: Count
     correction: Scalar
     max_correction: Scalar
-
-
-def outcome_of(events: Events) -> Int[Array, ""]:
-    """Index into `OUTCOMES` of what ended the episode in this period, -1 if nothing did."""
-    flags = jnp.stack([events.captured, events.collided, events.reached, events.timed_out])
-    return jnp.where(jnp.any(flags), jnp.argmax(flags), RUNNING).astype(jnp.int32)
 
 
 @eqx.filter_jit

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sidestep.learning.control_step import control_step, decide, decision_steps_of
+from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.learning.records import OUTCOMES, write_bytes
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, as_shield
 from sidestep.trials.keys import as_key, start_and_pursuit
-from sidestep.trials.monte_carlo import RUNNING, outcome_of
 from sidestep.trials.policies import as_policy
 from sidestep.world import Events, Scenario, World
 
