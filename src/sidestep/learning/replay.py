@@ -181,7 +181,7 @@ def sample(
     world, next_world = (
         jax.tree.map(
             lambda mirrored, seen: jnp.where(jnp.expand_dims(flip, range(1, seen.ndim)), mirrored, seen),
-            mirror_world(world),
+            jax.vmap(mirror_world)(world),
             world,
         )
         for world in (with_target(picked.world), with_target(picked.next_world))
