@@ -5,7 +5,7 @@ n.u >= c demands h' >= -alpha(h) of the evader's velocity u (m/s, world axes), s
 """
 
 import abc
-from typing import Any, final
+from typing import Any, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -19,7 +19,10 @@ from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
 _KEEP_SIDE = 0.5
+_STEEPER = 1.5
 _LOST_SIDE = 0.1
+
+_NormalAndRate: TypeAlias = tuple[Float[Array, "2"], Scalar]
 
 
 class BarrierRows(eqx.Module):
@@ -52,8 +55,11 @@ def compose(*rows: BarrierRows) -> BarrierRows:
 class Barrier(eqx.Module):
     """One kind of barrier, kept towards every robot of a kind.
 
-    `memory ()` is what must be remembered about one robot from step to step; barriers without memory
-    leave it 0. All methods but `rows` and `remember` take one evader position (m) and one other robot.
+    Its row for one robot is n.u >= rate - alpha(h): n = dh/dp_e is how the evader raises h, `rate` how fast
+    the other robot lowers it (as far as this barrier takes it to), alpha(h) how fast h may shrink.
+
+    `memory ()` is what must be kept in mind about one robot from step to step; barriers without memory
+    leave it 0.
     """
 
     @abc.abstractmethod
@@ -68,17 +74,21 @@ class Barrier(eqx.Module):
         robot: Float[AnyArray, "d"],
         memory: Float[AnyArray, ""],
     ) -> Scalar:
-        """h (m)."""
+        """h (m) of one evader position (m) towards one robot."""
 
     @abc.abstractmethod
-    def row(
+    def approach(
         self,
         scenario: Scenario,
         evader: Float[AnyArray, "2"],
         robot: Float[AnyArray, "d"],
         memory: Float[AnyArray, ""],
     ) -> tuple[Float[Array, "2"], Scalar]:
-        """Unit normal n = dh/dp_e and offset c (m/s) of the row n.u >= c."""
+        """Unit normal n = dh/dp_e in world axes, and the rate (m/s) at which the robot lowers h."""
+
+    @abc.abstractmethod
+    def allowance(self, scenario: Scenario, h: Float[AnyArray, ""]) -> Scalar:
+        """alpha(h) (m/s), increasing, alpha(0) = 0: how fast h may shrink."""
 
     @abc.abstractmethod
     def recall(
@@ -90,29 +100,29 @@ class Barrier(eqx.Module):
     ) -> Scalar:
         """The memory to use now, given the one of the step before, or none at the start."""
 
+    def row(
+        self,
+        scenario: Scenario,
+        evader: Float[AnyArray, "2"],
+        robot: Float[AnyArray, "d"],
+        memory: Float[AnyArray, ""],
+    ) -> tuple[Scalar, Float[Array, "2"], Scalar]:
+        """h (m), and normal n and offset c (m/s) of the row n.u >= c, towards one robot."""
+        h = self.value(scenario, evader, robot, memory)
+        normal, rate = self.approach(scenario, evader, robot, memory)
+        return h, normal, rate - self.allowance(scenario, h)
+
+    def rows(self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"]) -> BarrierRows:
+        """Value and row towards every robot; `memory` as `remember` returned it for this world."""
+        row = jax.vmap(self.row, in_axes=(None, None, 0, 0))
+        return BarrierRows(*row(scenario, world.evader, self.robots(world), memory))
+
     def remember(
         self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"] | None = None
     ) -> Float[Array, "n"]:
         """`recall` for every robot."""
-        if memory is None:
-            return jax.vmap(lambda robot: self.recall(scenario, world.evader, robot, None))(
-                self.robots(world)
-            )
-        return jax.vmap(lambda robot, side: self.recall(scenario, world.evader, robot, side))(
-            self.robots(world), memory
-        )
-
-    def rows(self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"]) -> BarrierRows:
-        """Value and row towards every robot; `memory` as `remember` returned it for this world."""
-
-        def one(robot: Any, side: Any) -> BarrierRows:
-            normal, offset = self.row(scenario, world.evader, robot, side)
-            return BarrierRows(
-                self.value(scenario, world.evader, robot, side)[None], normal[None], offset[None]
-            )
-
-        rows = jax.vmap(one)(self.robots(world), memory)
-        return BarrierRows(rows.values[:, 0], rows.normals[:, 0], rows.offsets[:, 0])
+        recall = jax.vmap(self.recall, in_axes=(None, None, 0, None if memory is None else 0))
+        return recall(scenario, world.evader, self.robots(world), memory)
 
 
 def _away(offset: Float[Array, "2"]) -> tuple[Scalar, Float[Array, "2"]]:
@@ -136,12 +146,12 @@ class ObstacleBarrier(Barrier):
     def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
         return _away(evader - robot[:2])[0] - scenario.collision_distance
 
-    def row(
-        self, scenario: Scenario, evader: Any, robot: Any, memory: Any
-    ) -> tuple[Float[Array, "2"], Scalar]:
-        distance, normal = _away(evader - robot[:2])
-        h = distance - scenario.collision_distance
-        return normal, jnp.sum(normal * robot[2:]) - scenario.obstacle_gain * h
+    def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
+        normal = _away(evader - robot[:2])[1]
+        return normal, jnp.sum(normal * robot[2:])
+
+    def allowance(self, scenario: Scenario, h: Any) -> Scalar:
+        return scenario.obstacle_gain * h
 
     def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
         return jnp.zeros_like(real(evader)[0])
@@ -155,6 +165,7 @@ class RangeBarrier(Barrier):
 
     This is the paper's derivation; its printed b_pv has the sign of the pursuer's velocity turned round.
     The row cannot be kept close ahead of the pursuer, where n.u <= v_e < V: there h < (V - v_e)/gamma_pv.
+    And it takes a pursuer that backs onto the evader to be driving away.
     """
 
     def robots(self, world: World) -> Float[Array, "n 3"]:
@@ -163,13 +174,13 @@ class RangeBarrier(Barrier):
     def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
         return _away(evader - robot[:2])[0] - scenario.capture_distance
 
-    def row(
-        self, scenario: Scenario, evader: Any, robot: Any, memory: Any
-    ) -> tuple[Float[Array, "2"], Scalar]:
-        distance, normal = _away(evader - robot[:2])
-        h = distance - scenario.capture_distance
-        approach = scenario.pursuer_speed * (normal[0] * jnp.cos(robot[2]) + normal[1] * jnp.sin(robot[2]))
-        return normal, approach - scenario.pursuer_gain * h
+    def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
+        normal = _away(evader - robot[:2])[1]
+        ahead = normal[0] * jnp.cos(robot[2]) + normal[1] * jnp.sin(robot[2])
+        return normal, scenario.pursuer_speed * ahead
+
+    def allowance(self, scenario: Scenario, h: Any) -> Scalar:
+        return scenario.pursuer_gain * h
 
     def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
         return jnp.zeros_like(real(evader)[0])
@@ -180,19 +191,19 @@ class PursuitBarrier(Barrier):
     """The barrier of the capture game: holds against every admissible motion of the pursuer.
 
     h is the signed distance from the capture set, see `CaptureGame.barrier`, and the row is
-    n.u >= V max(|n_x|, |sigma|/b) - alpha(h), the right side being the fastest the pursuer can lower h.
+    n.u >= V max(|n_x|, |sigma|/b) - alpha(h), the first term being the fastest the pursuer can lower h.
 
-    With h_max = l_max - l, alpha(h) = gamma min(h, h_max) + max(gamma, (V/b) tan S) (h - h_max)+: the gain
-    gamma as far as any gain will do (0 <= h <= h_max), and beyond it at least the slope that keeps the row
-    feasible. So for l <= l_max every h >= 0 has a feasible row, whatever the gain. For l > l_max the
-    pursuer wins, rows near its axis cannot be kept, and the filter answers with the least violation.
+    With h_max = l_max - l, alpha(h) = gamma min(h, h_max) + max(gamma, 1.5 (V/b) tan S) (h - h_max)+: the
+    gain gamma as far as any gain will do (0 <= h <= h_max), and beyond it at least half again the slope that
+    just keeps the row feasible. So for l <= l_max every h >= 0 has a feasible row, whatever the gain. For
+    l > l_max the pursuer wins, rows near its axis cannot be kept, and the filter violates them least.
 
     **Memory**: the side (+1 left, -1 right of the pursuer's axis) of the tangent line to follow in front
-    and behind. On the axis either side's row is feasible but not both, and changing sides at every crossing
-    would hold the evader on the axis until it is caught. So a side once taken is kept beyond the axis, as
-    long as its own row stays feasible: across the axis by |y|, that is
-    |y| <= cos S (b rho - (l + h) tan S + (b/V) alpha(h)), which for h = 0 is m cos S with
-    m = b rho - l tan S. It is left at half of that, for the evader's own side, whose h is larger.
+    and behind. On the axis either side's row is feasible but, at the tip of the capture set, not both. To
+    keep from changing sides at every crossing, a side once taken is kept beyond the axis as long as its own
+    row stays feasible: across the axis by |y|, that is |y| <= cos S (b rho - (l + h) tan S + (b/V) alpha(h)),
+    which for h = 0 is m cos S with m = b rho - l tan S. It is left at half of that, for the evader's own
+    side, whose h is larger: with 2 |y| sin S = h_own - h, the change never lowers the value.
     """
 
     def robots(self, world: World) -> Float[Array, "n 3"]:
@@ -201,26 +212,21 @@ class PursuitBarrier(Barrier):
     def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
         return CaptureGame.of(scenario).barrier(to_pursuer_frame(evader, robot), memory)[0]
 
-    def row(
-        self, scenario: Scenario, evader: Any, robot: Any, memory: Any
-    ) -> tuple[Float[Array, "2"], Scalar]:
+    def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(evader, robot)
-        h, normal = game.barrier(z, memory)
+        ahead, left = normal = game.barrier(z, memory)[1]
         cosine, sine = jnp.cos(robot[2]), jnp.sin(robot[2])
-        ahead, left = normal[0], normal[1]
         world_normal = jnp.stack([cosine * ahead - sine * left, sine * ahead + cosine * left])
         # A pursuer that turns at no cost (b = 0) has no finite rate; any that cannot be kept says the same.
-        rate = jnp.minimum(game.pursuit_rate(z, normal), 1e3 * game.pursuer_speed)
-        return world_normal, rate - self.allowance(scenario, h)
+        return world_normal, jnp.minimum(game.pursuit_rate(z, normal), 1e3 * game.pursuer_speed)
 
-    def allowance(self, scenario: Scenario, h: Float[AnyArray, ""]) -> Scalar:
-        """alpha(h) (m/s): how fast h may shrink."""
+    def allowance(self, scenario: Scenario, h: Any) -> Scalar:
         game = CaptureGame.of(scenario)
         gain, axle = scenario.pursuer_gain, game.half_axle
         spare = jnp.maximum(game.largest_capture_distance - game.capture_distance, 0.0)
         turning = game.pursuer_speed * jnp.tan(game.usable_angle) / jnp.where(axle > 0.0, axle, 1.0)
-        steep = jnp.maximum(gain, jnp.where(axle > 0.0, turning, 0.0))
+        steep = jnp.maximum(gain, jnp.where(axle > 0.0, _STEEPER * turning, 0.0))
         return gain * jnp.minimum(h, spare) + steep * jnp.maximum(h - spare, 0.0)
 
     def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:

@@ -71,12 +71,15 @@ def _disc_level(rows: Rows, first: int) -> Scalar:
     level = jnp.max(rows.c[first:]) - 1.0
     pairs = list(combinations(range(count), 2))
     if free := [pair for pair in pairs if pair[0] >= first]:
-        level = jnp.maximum(level, jnp.max(_free_pair(*_take(rows, free))))
+        p, q = _take(rows, free)
+        level = jnp.maximum(level, jnp.max(_free_pair(p, q)))
     if mixed := [pair for pair in pairs if pair[0] < first <= pair[1]]:
-        level = jnp.maximum(level, jnp.max(_kept_pair(*_take(rows, mixed))))
+        kept, other = _take(rows, mixed)
+        level = jnp.maximum(level, jnp.max(_kept_pair(kept, other)))
     # At least one of the three is free; the last one, as indices ascend.
     if triples := [three for three in combinations(range(count), 3) if three[2] >= first]:
-        level = jnp.maximum(level, jnp.max(_triple(*_take(rows, triples), triples, first)))
+        p, q, r = _take(rows, triples)
+        level = jnp.maximum(level, jnp.max(_triple(p, q, r, triples, first)))
     return level
 
 
