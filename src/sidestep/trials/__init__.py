@@ -1,5 +1,6 @@
 """What was measured? Batch evaluation, statistics, recorded episodes."""
 
+from sidestep.trials.captures import Capture, count_causes, explain_capture
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.keys import episode_key
 from sidestep.trials.monte_carlo import evaluate
@@ -13,11 +14,14 @@ from sidestep.trials.statistics import (
 )
 
 __all__ = [
+    "Capture",
     "Evaluation",
     "Trajectory",
     "as_policy",
+    "count_causes",
     "episode_key",
     "evaluate",
+    "explain_capture",
     "interquartile_mean",
     "load_trajectory",
     "rollout",

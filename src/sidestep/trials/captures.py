@@ -1,0 +1,74 @@
+"""How the paper's shield comes to lose: what its row expected of the pursuer, and what the pursuer did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.trials.rollout import Trajectory
+from sidestep.world import Scenario
+
+CAUSES = ("reversing", "head-on", "other")
+"""`reversing`: the pursuer drove backwards, the row took it to be leaving. `head-on`: no velocity satisfied the
+row. `other`: neither, in the end."""
+
+_LAST_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture, period by period, seen along the line from the pursuer to the evader.
+
+    All speeds are along n, the unit vector from the pursuer to the evader, in m/s: `expected` the least n.u
+    that the paper's row asks for, V n.(cos theta, sin theta) - gamma h, which takes the pursuer to drive
+    forwards; `needed` the least that its true speed v asks for, v n.(cos theta, sin theta) - gamma h; `moved`
+    the evader's n.u. `range_barrier` is h = |p_e - p_d| - l in m. `pursuer` is the one that caught it; from
+    `decisive_period` on it moved less than needed, to the end.
+    """
+
+    pursuer: int
+    cause: str
+    decisive_period: int
+    normal: Float[np.ndarray, "t 2"]
+    range_barrier: Float[np.ndarray, "t"]
+    expected: Float[np.ndarray, "t"]
+    needed: Float[np.ndarray, "t"]
+    moved: Float[np.ndarray, "t"]
+
+
+
+def explain_capture(scenario: Scenario, trajectory: Trajectory) -> Capture:
+    """What happened on the way to a capture. **Raises** `ValueError` when the episode did not end in one."""
+    if trajectory.outcome != "captured":
+        raise ValueError(f"the episode ended '{trajectory.outcome}', not in a capture")
+    evader, pursuers = np.asarray(trajectory.worlds.evader), np.asarray(trajectory.worlds.pursuers)
+    last = pursuers[-1, :, :2] - evader[-1]
+    pursuer = int(np.argmin(np.hypot(last[:, 0], last[:, 1])))
+    poses, wheels = pursuers[:-1, pursuer], np.asarray(trajectory.worlds.wheel_speeds)[1:, pursuer]
+    offset = evader[:-1] - poses[:, :2]
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    normal = offset / np.maximum(distance, np.finfo(distance.dtype).tiny)[:, None]
+    ahead = normal[:, 0] * np.cos(poses[:, 2]) + normal[:, 1] * np.sin(poses[:, 2])
+    h = distance - float(scenario.capture_distance)
+    spare = float(scenario.pursuer_gain) * h
+    expected = float(scenario.pursuer_speed) * ahead - spare
+    needed = wheels.mean(axis=-1) * ahead - spare
+    moved = np.sum(normal * np.asarray(trajectory.action), axis=-1)
+
+    final = slice(-max(1, round(_LAST_SECONDS / float(scenario.control_period))), None)
+    closing = needed[final] + spare[final] > 0.0
+    reversing = bool(np.any(closing & (wheels[final].mean(axis=-1) < 0.0)))
+    beyond = expected > float(scenario.evader_speed)
+    cause = "reversing" if reversing else "head-on" if bool(np.any(beyond[final])) else "other"
+    calm = np.flatnonzero(moved >= needed - 1e-6)
+    decisive = min(int(calm[-1]) + 1 if len(calm) else 0, trajectory.length - 1)
+    return Capture(pursuer, cause, decisive, normal, h, expected, needed, moved)
+
+
+def count_causes(scenario: Scenario, trajectories: Sequence[Trajectory]) -> dict[str, int]:
+    """How many of these captures had which of `CAUSES`."""
+    causes = [explain_capture(scenario, trajectory).cause for trajectory in trajectories]
+    return {cause: causes.count(cause) for cause in CAUSES}

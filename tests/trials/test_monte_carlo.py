@@ -1,0 +1,190 @@
+"""Hazards of evaluation: counts that do not add up, results that depend on how they were computed, code of
+others that misbehaves."""
+
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.learning.records import OUTCOMES
+from sidestep.trials import Evaluation, episode_key, evaluate, rollout
+from sidestep.trials import monte_carlo as module
+from sidestep.world import goal_seeking, load_scenario
+
+# Crowded and short, so that every outcome occurs.
+SETTING = {"arena_side": 2.0, "obstacle_count": 2, "episode_steps": 220}
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("paper", **SETTING)
+
+
+@pytest.fixture(scope="module")
+def evaluation(scenario):
+    return evaluate(scenario, "goal-seeking", "none", "turn-then-drive", 150, 7, batch=32)
+
+
+def test_outcomes_are_exclusive_and_add_up(evaluation):
+    counts = [getattr(evaluation, name) for name in OUTCOMES]
+    assert evaluation.episodes == sum(counts) == 150
+    assert min(counts) > 0
+    assert evaluation.safe == evaluation.reached + evaluation.timed_out
+    assert np.array_equal(np.bincount(evaluation.outcome, minlength=4), counts)
+
+
+def test_figures_agree_with_the_outcomes(evaluation, scenario):
+    captured, collided = evaluation.numbers_of("captured"), evaluation.numbers_of("collided")
+    assert np.all(evaluation.min_pursuer_clearance[captured] <= 0.0)
+    others = np.setdiff1d(np.arange(150), captured)
+    assert np.all(evaluation.min_pursuer_clearance[others] > 0.0)
+    assert np.all(evaluation.min_obstacle_clearance[collided] <= 0.0)
+    assert np.all(evaluation.returns[evaluation.numbers_of("reached")] > 900.0)
+    assert np.all(evaluation.steps[evaluation.numbers_of("timed_out")] == scenario.episode_steps)
+    assert np.allclose(evaluation.times, evaluation.steps * 0.05)
+
+
+def test_results_do_not_depend_on_the_batch_size(evaluation, scenario):
+    other = evaluate(scenario, "goal-seeking", "none", "turn-then-drive", 150, jax.random.key(7), batch=200)
+    assert np.array_equal(other.outcome, evaluation.outcome)
+    assert np.array_equal(other.steps, evaluation.steps)
+    assert np.allclose(other.returns, evaluation.returns, rtol=1e-4)
+    assert np.allclose(other.min_pursuer_clearance, evaluation.min_pursuer_clearance, atol=1e-4)
+
+
+def test_more_episodes_do_not_change_the_first_ones(evaluation, scenario):
+    fewer = evaluate(scenario, "goal-seeking", "none", "turn-then-drive", 40, 7, batch=32)
+    assert np.array_equal(fewer.outcome, evaluation.outcome[:40])
+    assert np.array_equal(fewer.returns, evaluation.returns[:40])
+
+
+def test_another_scenario_value_does_not_compile_again(evaluation, scenario):
+    before = module._advance._cached._cache_size()  # pyright: ignore
+    faster = load_scenario("paper", **{**SETTING, "arena_side": 2.5, "pursuer_speed": 0.3})
+    result = evaluate(faster, "goal-seeking", "none", "turn-then-drive", 33, 8, batch=32)
+    assert module._advance._cached._cache_size() == before  # pyright: ignore
+    assert result.episodes == 33
+
+
+@pytest.mark.parametrize("number", [0, 3, 77])
+def test_any_episode_can_be_run_again_alone(evaluation, scenario, number):
+    trajectory = rollout(scenario, "goal-seeking", "none", "turn-then-drive", episode_key(7, number))
+    assert trajectory.outcome == OUTCOMES[evaluation.outcome[number]]
+    assert trajectory.length == evaluation.steps[number]
+    assert float(trajectory.events.reward.sum()) == pytest.approx(evaluation.returns[number], rel=1e-4)
+
+
+def test_report_holds_no_number_that_json_cannot():
+    def none_of(value):
+        return np.full(2, value)
+
+    report = Evaluation(
+        outcome=none_of(OUTCOMES.index("timed_out")),
+        returns=none_of(-5.0),
+        steps=none_of(3),
+        times=none_of(0.15),
+        min_pursuer_clearance=none_of(0.4),
+        min_obstacle_clearance=none_of(np.inf),
+        interventions=none_of(0),
+        infeasible=none_of(0),
+        invalid=none_of(0),
+        mean_correction=none_of(0.0),
+        max_correction=none_of(0.0),
+    ).to_dict()
+    text = json.dumps(report, allow_nan=False)
+    assert json.loads(text) == report
+    assert report["timed_out"] == 2
+    assert report["reach_time_median"] is None
+    assert report["min_obstacle_clearance"] is None
+    assert set(report["obstacle_clearance_quantiles"].values()) == {None}
+
+
+def test_report_has_bounds_for_every_rate(evaluation):
+    report = evaluation.to_dict()
+    for name in (*OUTCOMES, "safe"):
+        assert (
+            0.0 <= report[f"{name}_rate_low"] <= report[f"{name}_rate"] <= report[f"{name}_rate_high"] <= 1.0
+        )
+        assert report[f"{name}_rate_low"] < report[f"{name}_rate_high"]
+
+
+def test_shield_steps_are_counted(scenario):
+    shielded = evaluate(scenario, "goal-seeking", "paper", "turn-then-drive", 40, 1, batch=32)
+    assert 0 < shielded.intervention_rate < 1
+    assert np.all(shielded.infeasible <= shielded.interventions)
+    assert shielded.invalid_rate == 0.0
+    assert np.all(shielded.mean_correction <= shielded.max_correction)
+    assert shielded.to_dict()["max_correction"] <= 2 * 0.1574 + 1e-6
+
+
+def test_policy_that_answers_nan_is_counted_not_obeyed(scenario):
+    result = evaluate(scenario, lambda obs: obs[:2] * jnp.nan, "none", "still", 4, 0, batch=32)
+    assert np.array_equal(result.invalid, result.steps)
+    assert np.all(np.isfinite(result.returns))
+    assert np.all(np.isfinite(result.max_correction))
+
+
+def test_pursuer_with_an_answer_of_the_wrong_shape_is_refused(scenario):
+    with pytest.raises(ValueError, match=r"shape \(2,\)"):
+        evaluate(scenario, "goal-seeking", "none", lambda s, w, k: jnp.zeros(3), 1, 0, batch=32)
+
+
+def test_pursuer_that_cheats_is_kept_to_its_wheel_limits(scenario):
+    trajectory = rollout(
+        scenario, "goal-seeking", "none", lambda s, w, k: jnp.array([1e6, jnp.nan]), 0, steps=50
+    )
+    moved = np.diff(np.asarray(trajectory.worlds.pursuers), axis=0)[:, 0, :2]
+    assert np.max(np.hypot(*moved.T)) <= 0.2 * 0.05 + 1e-6
+    assert np.all(np.isfinite(trajectory.worlds.evader))
+
+
+@pytest.mark.parametrize("bad", [0, -1, 2.5, True, "many"])
+def test_a_number_of_episodes_that_makes_no_sense_is_refused(scenario, bad):
+    with pytest.raises(ValueError, match="episodes"):
+        module._positive("episodes", bad)
+
+
+def test_unknown_names_are_named(scenario):
+    with pytest.raises(ValueError, match="sliding"):
+        evaluate(scenario, "goal-seeking", "sliding", "nash", 1, 0)
+    with pytest.raises(ValueError, match="sneaky"):
+        evaluate(scenario, "goal-seeking", "none", "sneaky", 1, 0)
+    with pytest.raises(ValueError, match="clever"):
+        evaluate(scenario, "clever", "none", "nash", 1, 0)
+
+
+def test_policy_is_asked_only_when_a_decision_is_due(scenario):
+    class Slow(eqx.Module):
+        decision_steps: int = eqx.field(static=True)
+
+        def __call__(self, observation):
+            return goal_seeking(observation)
+
+    slow = evaluate(scenario, Slow(7), "paper", "turn-then-drive", 20, 3, batch=32)
+    for number in (0, 11):
+        trajectory = rollout(scenario, Slow(7), "paper", "turn-then-drive", episode_key(3, number))
+        assert trajectory.length == slow.steps[number]
+        changes = np.flatnonzero(np.any(np.diff(np.asarray(trajectory.nominal), axis=0) != 0.0, axis=-1)) + 1
+        assert len(changes)
+        assert np.all(changes % 7 == 0)
+
+
+def test_progress_never_goes_back_and_ends_at_all(scenario):
+    seen = []
+    run = lambda progress: evaluate(  # noqa: E731
+        scenario, "goal-seeking", "none", "turn-then-drive", 40, 0, batch=32, progress=progress
+    )
+    run(lambda *count: seen.append(count))
+    assert seen == sorted(seen)
+    assert seen[-1] == (40, 40)
+
+
+def test_several_pursuers_each_move():
+    crowd = load_scenario("paper", pursuer_count=3, episode_steps=30)
+    trajectory = rollout(crowd, "goal-seeking", "none", "turn-then-drive", 2)
+    moved = np.abs(np.asarray(trajectory.worlds.pursuers[-1] - trajectory.worlds.pursuers[0]))
+    assert np.all(moved.sum(axis=-1) > 0.0)
+    assert trajectory.barriers.shape == (trajectory.length, 4)

@@ -1,0 +1,92 @@
+"""Hazards of recordings: frames that do not belong together, records past the end, damaged files."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.trials import load_trajectory, rollout, save_trajectory
+from sidestep.world import load_scenario
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("paper-test")
+
+
+@pytest.fixture(scope="module")
+def trajectory(scenario):
+    return rollout(scenario, "goal-seeking", "paper", "turn-then-drive", 0)
+
+
+def test_recorded_actions_reproduce_the_recorded_worlds(scenario, trajectory):
+    assert trajectory.length > 50
+    assert trajectory.worlds.evader.shape == (trajectory.length + 1, 2)
+    for t in (0, 17, trajectory.length - 1):
+        world = jax.tree.map(lambda leaf, t=t: leaf[t], trajectory.worlds)
+        moved, events = scenario.step(world, trajectory.action[t], trajectory.wheel_speeds[t])
+        assert np.allclose(moved.evader, trajectory.worlds.evader[t + 1], atol=1e-6)
+        assert np.allclose(moved.pursuers, trajectory.worlds.pursuers[t + 1], atol=1e-6)
+        assert float(events.reward) == pytest.approx(float(trajectory.events.reward[t]))
+        assert float(trajectory.intervention[t]) == pytest.approx(
+            float(jnp.linalg.norm(trajectory.action[t] - trajectory.nominal[t])), abs=1e-6
+        )
+
+
+def test_recording_stops_at_the_first_event(trajectory):
+    ended = np.asarray(trajectory.events.terminated | trajectory.events.truncated)
+    assert ended[-1]
+    assert not ended[:-1].any()
+    assert np.allclose(trajectory.worlds.time, 0.05 * np.arange(trajectory.length + 1), atol=1e-4)
+
+
+def test_the_test_scene_starts_where_the_paper_says(trajectory):
+    assert np.allclose(trajectory.worlds.evader[0], [0.0, 0.0])
+    assert np.allclose(trajectory.worlds.pursuers[0], [[1.0, -0.5, 0.0]])
+    assert np.allclose(trajectory.worlds.obstacles[0], [[1.5, 0.0, 0.02, 0.0]])
+
+
+def test_cut_recording_says_so(scenario):
+    cut = rollout(scenario, "goal-seeking", "none", "still", 0, steps=2)
+    assert cut.length == 2
+    assert cut.outcome == "cut"
+    with pytest.raises(ValueError, match="steps"):
+        rollout(scenario, "goal-seeking", "none", "still", 0, steps=0)
+
+
+def test_a_given_world_is_where_it_starts(scenario):
+    start = scenario.reset(jax.random.key(0))
+    shifted = jax.tree.map(lambda leaf: leaf, start)
+    record = rollout(scenario, "goal-seeking", "none", "still", 0, shifted, steps=2)
+    assert np.array_equal(record.worlds.pursuers[0], start.pursuers)
+
+
+def test_saved_trajectory_comes_back_whole(trajectory, tmp_path):
+    save_trajectory(tmp_path / "scene.npz", trajectory)
+    back = load_trajectory(tmp_path / "scene.npz")
+    assert jax.tree.structure(back) == jax.tree.structure(trajectory)
+    assert all(
+        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(trajectory), strict=True)
+    )
+    assert back.outcome == trajectory.outcome
+
+
+def test_damaged_file_is_refused(tmp_path):
+    (tmp_path / "scene.npz").write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="no recorded trajectory"):
+        load_trajectory(tmp_path / "scene.npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(ValueError, match="no recorded trajectory"):
+        load_trajectory(tmp_path / "other.npz")
+
+
+def test_two_recordings_are_the_same(scenario, trajectory):
+    again = rollout(scenario, "goal-seeking", "paper", "turn-then-drive", 0)
+    assert np.array_equal(again.worlds.evader, trajectory.worlds.evader)
+
+
+def test_recording_in_double_precision(scenario):
+    with jax.enable_x64(True):
+        wide = rollout(load_scenario("paper-test"), "goal-seeking", "game", "turn-then-drive", 0, steps=40)
+        assert wide.worlds.evader.dtype == np.float64
+        assert np.all(np.isfinite(wide.worlds.evader))
