@@ -1,0 +1,129 @@
+"""The project around the code: can a stranger install, import and trust what the files say?"""
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.specifiers import SpecifierSet
+
+import sidestep
+from sidestep.learning import make_options, options_to_dict
+from sidestep.world import Scenario
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+
+
+def text(name):
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def parts(requirement):
+    """Name and version bounds of `name[extra]>=1,<2`."""
+    name, bounds = re.fullmatch(r"([\w.-]+)(?:\[[\w,]+\])?(.*)", requirement).groups()
+    return name.lower().replace("_", "-"), bounds
+
+
+def pins():
+    return dict(re.findall(r"^([\w.-]+)==([\w.]+)", text("requirements.lock"), re.MULTILINE))
+
+
+def test_lock_holds_no_address_and_a_hash_for_every_pin():
+    lock = text("requirements.lock")
+    assert "://" not in lock
+    assert not re.search(r"--(extra-)?index-url|--find-links", lock)
+    entries = re.split(r"\n(?=[\w.-]+==)", lock.strip())
+    assert len(entries) == len(pins())
+    assert all("--hash=sha256:" in entry for entry in entries)
+    assert not {"torch", "stable-baselines3"} & set(pins())
+
+
+def test_lock_pins_every_declared_dependency_within_its_bounds():
+    declared = [
+        *PROJECT["project"]["dependencies"],
+        *EXTRAS["dev"],
+        *EXTRAS["docs"],
+        *PROJECT["build-system"]["requires"],
+    ]
+    for requirement in declared:
+        name, bounds = parts(requirement)
+        assert name in pins(), f"run make lock: {name} is not pinned"
+        assert pins()[name] in SpecifierSet(bounds), f"run make lock: {name}"
+
+
+def test_every_dependency_has_a_lower_and_an_upper_bound():
+    for requirement in [
+        *PROJECT["project"]["dependencies"],
+        *(entry for extra in EXTRAS.values() for entry in extra),
+    ]:
+        name, bounds = parts(requirement)
+        assert ">=" in bounds, name
+        assert "<" in bounds, name
+
+
+def test_versions_agree():
+    assert f"version: {sidestep.__version__}\n" in text("CITATION.cff")
+
+
+@pytest.mark.parametrize("module", ["sidestep", "sidestep.cli", "sidestep.trials"])
+def test_import_needs_nothing_optional(module):
+    optional = [
+        "gymnasium",
+        "stable_baselines3",
+        "torch",
+        "scipy",
+        "qpsolvers",
+        "clarabel",
+        "mujoco",
+        "onnx",
+        "rclpy",
+    ]
+    code = (
+        "import sys\n"
+        f"sys.modules.update(dict.fromkeys({optional!r}))\n"  # None in sys.modules makes an import fail
+        f"import {module}\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_public_name_can_be_imported():
+    for name in sidestep.__all__:
+        assert getattr(sidestep, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        sidestep.nothing  # noqa: B018
+
+
+def test_docs_name_options_with_their_real_defaults():
+    defaults = options_to_dict(make_options())
+    row = re.compile(r"`(\w+)=([^`]+)` \(`?[^)]*\)")
+    found = {}
+    for line in text("docs/learning.md").splitlines():
+        for name, value in row.findall(line) if line.startswith("|") else ():
+            found[name] = ast.literal_eval(value)
+    assert len(found) >= 7
+    for name, value in found.items():
+        actual = defaults[name] if name in defaults else getattr(Scenario(), name)
+        assert actual == value, f"docs/learning.md says {name}={value!r}, it is {actual!r}"
+
+
+def test_docs_name_scenario_constants_that_exist():
+    table = text("docs/paper.md").partition("## What the paper does not print")[2].partition("\n## ")[0]
+    named = re.findall(r"\(`(\w+)`\)", table)
+    assert len(named) >= 5
+    for name in named:
+        assert hasattr(Scenario(), name)
+
+
+@pytest.mark.parametrize("example", sorted(path.name for path in (ROOT / "examples").glob("*.py")))
+def test_examples_run(example):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / example)], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
