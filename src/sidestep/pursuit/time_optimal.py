@@ -92,7 +92,7 @@ def _time_from_turn(shape: _Shape, s: Scalar) -> Scalar:
 def _bisect(negative: Callable[[Scalar], Bool[Array, ""]], low: Scalar, high: Scalar) -> Scalar:
     """Where a function of one variable turns from `negative` to not, to the last bit that matters."""
 
-    def halve(_: int, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+    def halve(_: Array, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = ends
         middle = 0.5 * (low + high)
         below = negative(middle)
