@@ -1,0 +1,23 @@
+"""What people see: figures and the report."""
+
+from sidestep.views.capture_figure import capture_figure
+from sidestep.views.report import write_report
+from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
+from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
+from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
+
+__all__ = [
+    "CAPTURE_FILE",
+    "EVALUATION_FILE",
+    "SCENE_FILE",
+    "Run",
+    "capture_figure",
+    "load_run",
+    "outcome_figure",
+    "reward_figure",
+    "safety_rows",
+    "safety_table",
+    "scenes_figure",
+    "trajectory_figure",
+    "write_report",
+]

@@ -1,0 +1,276 @@
+"""The report of one or several runs: one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import importlib.metadata
+import platform
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+import sidestep
+from sidestep.learning.records import converged_episode, write_bytes
+from sidestep.pursuit import CaptureGame
+from sidestep.trials import Capture, Trajectory, explain_capture
+from sidestep.views.capture_figure import capture_figure
+from sidestep.views.runs import Run, by_shield, load_run
+from sidestep.views.style import OUTCOME_WORDS, shield_colour, shield_words
+from sidestep.views.training_figures import (
+    PAPER_CONVERGED,
+    outcome_figure,
+    reward_figure,
+    safety_rows,
+    safety_table,
+)
+from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
+from sidestep.world import Scenario
+
+_PACKAGES = ("jax", "equinox", "optax", "numpy", "matplotlib")
+_CAUSE_WORDS = {
+    "reversing": "the pursuer drove backwards, which the row takes for leaving",
+    "head-on": "the pursuer came straight on, and no velocity satisfied the row",
+    "other": "neither",
+}
+
+
+def write_report(
+    runs: Sequence[Run | str | Path],
+    path: str | Path,
+    *,
+    figures: str | Path | None = None,
+    command: str | None = None,
+) -> Path:
+    """Draw the figures of these runs and write the report.
+
+    **Arguments:** `runs` run folders, or `Run`s; several seeds of a shield are pooled, and its test scene and
+    capture are those of its first run that has one. `path` the HTML file; `figures` the folder for the
+    figures as PNG and PDF (`figures` beside `path` if not given); `command` what to type to run it again.
+
+    **Raises** `ValueError` without a run, `RunError` for a folder that holds none.
+    """
+    if not runs:
+        raise ValueError("a report needs at least one run")
+    loaded = [run if isinstance(run, Run) else load_run(run) for run in runs]
+    path = Path(path)
+    folder = path.parent / "figures" if figures is None else Path(figures)
+    safety_table(loaded, folder / "safety")
+    content = _content(loaded, folder) | {"command": command}
+    environment = Environment(
+        loader=PackageLoader("sidestep.views"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    html = environment.get_template("report.html").render(content)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, html.encode())
+    return path
+
+
+def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
+    groups = by_shield(runs)
+    first = runs[0]
+    scenario = first.scenario
+    evaluations = {shield: values for shield, (_, values) in _first_of(groups, "evaluation").items()}
+    untrained = {shield: values for shield, (_, values) in _first_of(groups, "untrained_evaluation").items()}
+    untrained_scenes = {shield: scene for shield, (_, scene) in _first_of(groups, "untrained_scene").items()}
+    scenes = _first_of(groups, "scene")
+    return {
+        "title": f"{scenario.name} scenario: " + ", ".join(shield_words(shield) for shield in groups),
+        "version": first.config.get("version", sidestep.__version__),
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "python": platform.python_version(),
+        "pursuers": sorted({str(run.config.get("pursuer", "?")) for run in runs}),
+        "seeds": sorted({run.seed for run in runs}),
+        "cards": [_card(shield, group, scenes) for shield, group in groups.items()],
+        "comparison": _comparison(groups, scenes),
+        "reward": _figure(reward_figure(runs, folder / "reward")),
+        "several_seeds": any(len(group) > 1 for group in groups.values()),
+        "evaluations": evaluations,
+        "untrained": untrained,
+        "untrained_scenes": _figure(
+            scenes_figure(scenario, untrained_scenes, folder / "test-scene-untrained")
+        )
+        if untrained_scenes
+        else None,
+        "outcomes": _figure(outcome_figure(evaluations, folder / "outcomes")) if evaluations else None,
+        "scenes": [_scene(run.scenario, shield, scene, folder) for shield, (run, scene) in scenes.items()],
+        "capture": _capture_section(groups, folder),
+        "game": _game_numbers(scenario),
+        "configurations": [_configuration(run) for run in runs],
+        "outcome_words": OUTCOME_WORDS,
+        "shield_words": shield_words,
+        "colour": shield_colour,
+        "percent": _percent,
+        "number": _number,
+        "paper_converged": PAPER_CONVERGED,
+    }
+
+
+def _first_of(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, tuple[Run, Any]]:
+    """By shield, the first run that has this field, and the field."""
+    found = {}
+    for shield, group in groups.items():
+        for run in group:
+            if getattr(run, field) is not None:
+                found[shield] = (run, getattr(run, field))
+                break
+    return found
+
+
+def _figure(written: tuple[Path, Path]) -> str:
+    """A PNG as a data URI."""
+    return "data:image/png;base64," + base64.b64encode(written[0].read_bytes()).decode()
+
+
+def _number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
+    """A number for readers; a dash for none."""
+    return "–" if value is None else f"{value:,.{digits}f}{unit}".replace("-", "−").replace(" ", "\u00a0")
+
+
+def _percent(value: float | int | None, digits: int = 1) -> str:
+    return "–" if value is None else f"{100 * value:.{digits}f}\u00a0%"
+
+
+def _convergence(group: Sequence[Run]) -> str:
+    """Where a shield's runs converged, in words."""
+    episodes = [converged_episode([float(e["return"]) for e in run.metrics]) for run in group]
+    found = sorted(episode for episode in episodes if episode is not None)
+    if len(group) == 1:
+        return f"episode {found[0]}" if found else "never"
+    return f"{len(found)} of {len(group)} seeds" + (f", at {', '.join(map(str, found))}" if found else "")
+
+
+def _card(shield: str, group: Sequence[Run], scenes: Mapping[str, tuple[Run, Trajectory]]) -> dict[str, Any]:
+    row = next(row for row in safety_rows(group) if row["shield"] == shield)
+    scene = scenes.get(shield)
+    return {
+        "shield": shield,
+        "safe": row["safe"],
+        "episodes": row["episodes"],
+        "captured": row["captured"],
+        "collided": row["collided"],
+        "converged": _convergence(group),
+        "scene": OUTCOME_WORDS[scene[1].outcome] if scene else None,
+    }
+
+
+def _pooled(group: Sequence[Run], key: str) -> list[float]:
+    return [float(episode[key]) for run in group for episode in run.metrics if episode.get(key) is not None]
+
+
+def _comparison(
+    groups: Mapping[str, Sequence[Run]], scenes: Mapping[str, tuple[Run, Trajectory]]
+) -> dict[str, Any]:
+    """The paper's figures beside ours: names of the columns, and rows of cells."""
+    safety = {row["shield"]: row for row in safety_rows([run for group in groups.values() for run in group])}
+    paper = safety.pop(None)
+    rows: list[tuple[str, list[str]]] = [
+        ("training episodes", [str(paper["episodes"]), *(str(row["episodes"]) for row in safety.values())]),
+        ("safe episodes", [str(paper["safe"]), *(str(row["safe"]) for row in safety.values())]),
+        *((name, ["0", *(str(row[name]) for row in safety.values())]) for name in ("captured", "collided")),
+        ("safety ratio", [_percent(row["ratio"]) for row in (paper, *safety.values())]),
+        (
+            "its 95 % bounds",
+            [f"{_percent(row['low'])[:-2]} to {_percent(row['high'])}" for row in (paper, *safety.values())],
+        ),
+        ("converged", [f"within {PAPER_CONVERGED} episodes", *(_convergence(g) for g in groups.values())]),
+    ]
+
+    def add(name: str, reported: str, cells: Sequence[str]) -> None:
+        rows.append((name, [reported, *cells]))
+
+    finals = [
+        np.mean([r for run in g for r in _pooled([run], "return")[-20:]] or [np.nan]) for g in groups.values()
+    ]
+    add("mean return of the last 20", "1000", [_number(None if np.isnan(f) else float(f), 0) for f in finals])
+    steps = [sum(_pooled(group, "steps")) for group in groups.values()]
+    for key, name in (("interventions", "periods corrected"), ("infeasible", "periods infeasible")):
+        shares = [
+            sum(_pooled(g, key)) / s if s else None for g, s in zip(groups.values(), steps, strict=True)
+        ]
+        add(name, "not reported", [_percent(share) for share in shares])
+    closest = [min(_pooled(group, "min_pursuer_clearance"), default=None) for group in groups.values()]
+    add("closest to capture", "not reported", [_number(value, 4, " m") for value in closest])
+    ends = [OUTCOME_WORDS[scenes[shield][1].outcome] if shield in scenes else "not run" for shield in groups]
+    add("the paper's test scene", "reached the target", ends)
+    return {"columns": ["the paper reports", *(shield_words(shield) for shield in groups)], "rows": rows}
+
+
+def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> dict[str, Any]:
+    written = trajectory_figure(
+        scenario, scene, folder / f"test-scene-{shield}", shield=shield, title="Paths, marked in seconds"
+    )
+    corrected = np.asarray(scene.intervention) > 1e-6
+    clear = float(np.min(np.asarray(scene.events.obstacle_clearance)))
+    return {
+        "shield": shield,
+        "figure": _figure(written),
+        "outcome": OUTCOME_WORDS[scene.outcome],
+        "seconds": scene.length * float(scenario.control_period),
+        "corrected": float(np.mean(corrected)) if len(corrected) else 0.0,
+        "closest": float(np.min(np.asarray(scene.events.pursuer_clearance))),
+        "clear": clear if np.isfinite(clear) else None,
+    }
+
+
+def _capture_section(groups: Mapping[str, Sequence[Run]], folder: Path) -> dict[str, Any] | None:
+    """One capture under the paper's shield, and how all of its captures came about, if known."""
+    found = _first_of({shield: group for shield, group in groups.items() if shield == "paper"}, "capture")
+    if not found:
+        return None
+    run, trajectory = found["paper"]
+    scenario = run.scenario
+    capture: Capture = explain_capture(scenario, trajectory)
+    evaluation = run.evaluation or {}
+    causes = {name: count for name, count in evaluation.get("capture_causes", {}).items() if count}
+    return {
+        "figure": _figure(capture_figure(scenario, trajectory, folder / "capture")),
+        "cause": capture.cause,
+        "late": capture.decisive_period * float(scenario.control_period),
+        "seconds": trajectory.length * float(scenario.control_period),
+        "barrier_then": float(capture.range_barrier[capture.decisive_period]),
+        "asked_last": float(capture.expected[-1]),
+        "needed_last": float(capture.needed[-1]),
+        "causes": {_CAUSE_WORDS.get(name, name): count for name, count in causes.items()},
+        "examined": sum(causes.values()),
+    }
+
+
+def _game_numbers(scenario: Scenario) -> dict[str, Any]:
+    game = CaptureGame.of(scenario)
+    evader, pursuer = float(scenario.evader_speed), float(scenario.pursuer_speed)
+    gain = float(scenario.pursuer_gain)
+    largest = float(game.largest_capture_distance)
+    return {
+        "evader_speed": evader,
+        "pursuer_speed": pursuer,
+        "capture_distance": float(scenario.capture_distance),
+        "gain": gain,
+        "slower": evader < pursuer,
+        "infeasible_below": (pursuer - evader) / gain if gain > 0 else None,
+        "largest_capture_distance": largest if np.isfinite(largest) else None,
+        "margin_mm": 1000 * (largest - float(scenario.capture_distance)) if np.isfinite(largest) else None,
+        "escapes": bool(game.evader_can_escape),
+        "period_ms": 1000 * float(scenario.control_period),
+    }
+
+
+def _configuration(run: Run) -> dict[str, Any]:
+    def shown(value: Any) -> str:
+        if value is None:
+            return "random"
+        return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+    return {
+        "name": f"{shield_words(run.shield)}, seed {run.seed}",
+        "run": {
+            key: shown(run.config.get(key)) for key in ("shield", "pursuer", "seed", "episodes", "version")
+        }
+        | {"seconds of training": _number(run.summary.get("wall_seconds"), 0)}
+        | {"control periods simulated": _number(run.summary.get("env_steps"), 0)},
+        "scenario": {key: shown(value) for key, value in run.config["scenario"].items()},
+        "learner": {key: shown(value) for key, value in run.config.get("learner", {}).items()},
+    }

@@ -1,0 +1,254 @@
+"""Drawing robots, paths and barriers into a scene (metres, equal aspect)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.patches import Circle, Polygon
+from matplotlib.patheffects import withStroke
+
+from sidestep.safety import ObstacleBarrier, PursuitBarrier, RangeBarrier
+from sidestep.trials import Trajectory
+from sidestep.views.style import EVADER, FAINT, INK, OBSTACLE, PURSUER, TARGET
+from sidestep.world import Scenario, World
+
+_MOST_MARKS = 8
+_LABEL_HALO = [withStroke(linewidth=1.8, foreground="white")]
+_ROBOT = 0.07
+"""Length of a drawn robot, m; sizes do not enter the problem."""
+
+
+def correction_colours() -> Colormap:
+    """Pale for small corrections, dark for large ones; apart from the path's blue at both ends."""
+    whole = matplotlib.colormaps["inferno_r"]
+    return LinearSegmentedColormap.from_list("correction", whole(np.linspace(0.12, 0.72, 128)))
+
+
+def capture_set_outline(scenario: Scenario, points: int = 181) -> Float[np.ndarray, "points 2"]:
+    """Outline of the capture set K in the pursuer's frame, m, closed.
+
+    The convex hull of the disc of radius l and the points (+-l/rho, 0); the disc alone when the evader is
+    at least as fast.
+    """
+    radius, usable = float(scenario.capture_distance), float(scenario.usable_angle)
+    left = np.linspace(usable, np.pi - usable, points // 2)
+    arc = radius * np.stack([np.cos(left), np.sin(left)], axis=-1)
+    apex = np.array([[radius / np.cos(usable), 0.0]])
+    return np.concatenate([apex, arc, -apex, -arc, apex])
+
+
+def to_world(points: Float[np.ndarray, "n 2"], pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 2"]:
+    """Points of a pursuer's frame in the world."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    return pose[:2] + points @ np.array([[cosine, sine], [-sine, cosine]])
+
+
+def mark_periods(duration: float, period: float) -> list[int]:
+    """Control periods at which a path gets a time mark: round seconds, at most eight."""
+    intervals = (0.5,) if duration <= 2.0 else (1, 2, 5, 10, 20, 30, 60, 120, 300)
+    interval = next((step for step in intervals if duration / step <= _MOST_MARKS), intervals[-1])
+    times = np.arange(interval, duration + 1e-9, interval)
+    return [round(time / period) for time in times]
+
+
+def world_at(trajectory: Trajectory, period: int) -> World:
+    """The world at the beginning of a control period."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[period]), trajectory.worlds)
+
+
+def closest_period(trajectory: Trajectory) -> int:
+    """The control period at whose beginning a pursuer was closest to the evader."""
+    gaps = np.asarray(trajectory.worlds.pursuers)[:, :, :2] - np.asarray(trajectory.worlds.evader)[:, None]
+    return int(np.argmin(np.min(np.hypot(gaps[..., 0], gaps[..., 1]), axis=1)))
+
+
+def _at(point: Float[np.ndarray, "..."]) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
+def set_limits(axes: Axes, points: Float[np.ndarray, "n 2"], margin: float) -> None:
+    """Equal scales, everything in view, `margin` metres around it."""
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+
+
+def draw_pursuer(
+    axes: Axes, pose: Float[np.ndarray, "3"], *, alpha: float = 1.0, size: float = _ROBOT
+) -> None:
+    """An arrowhead that points where the pursuer heads."""
+    shape = size * np.array([[0.75, 0.0], [-0.5, 0.5], [-0.25, 0.0], [-0.5, -0.5]])
+    axes.add_patch(
+        Polygon(
+            to_world(shape, pose), facecolor=PURSUER, edgecolor="white", linewidth=0.5, alpha=alpha, zorder=6
+        )
+    )
+
+
+def draw_capture_set(axes: Axes, scenario: Scenario, pose: Float[np.ndarray, "3"]) -> None:
+    """The capture circle and the capture set K around a pursuer."""
+    axes.add_patch(
+        Circle(
+            _at(pose[:2]),
+            float(scenario.capture_distance),
+            facecolor=PURSUER,
+            alpha=0.12,
+            linewidth=0,
+            zorder=1,
+        )
+    )
+    axes.add_patch(
+        Circle(
+            _at(pose[:2]),
+            float(scenario.capture_distance),
+            fill=False,
+            edgecolor=PURSUER,
+            linewidth=0.8,
+            zorder=2,
+        )
+    )
+    outline = to_world(capture_set_outline(scenario), pose)
+    axes.plot(*outline.T, color=PURSUER, linewidth=0.8, linestyle=(0, (3, 2)), zorder=2)
+
+
+def draw_obstacles(axes: Axes, scenario: Scenario, trajectory: Trajectory, period: int) -> None:
+    """The collision circle of each obstacle at one moment, where it started, and its path."""
+    radius = float(scenario.collision_distance)
+    path = np.asarray(trajectory.worlds.obstacles)
+    for index in range(path.shape[1]):
+        axes.plot(*path[:, index, :2].T, color=OBSTACLE, linewidth=1.0, zorder=2)
+        axes.add_patch(
+            Circle(
+                _at(path[0, index, :2]),
+                radius,
+                fill=False,
+                edgecolor=FAINT,
+                linewidth=0.8,
+                linestyle=":",
+                zorder=1,
+            )
+        )
+        axes.add_patch(
+            Circle(
+                _at(path[period, index, :2]), radius, facecolor=OBSTACLE, alpha=0.18, linewidth=0, zorder=1
+            )
+        )
+        axes.add_patch(
+            Circle(
+                _at(path[period, index, :2]), radius, fill=False, edgecolor=OBSTACLE, linewidth=0.8, zorder=2
+            )
+        )
+        axes.plot(*path[period, index, :2], "o", color=OBSTACLE, markersize=3, zorder=3)
+
+
+def draw_target(axes: Axes, scenario: Scenario, target: Float[np.ndarray, "2"]) -> None:
+    """The target and the distance that counts as reached."""
+    axes.add_patch(
+        Circle(
+            _at(target), float(scenario.reach_distance), facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2
+        )
+    )
+    axes.plot(
+        *target,
+        marker="*",
+        color=TARGET,
+        markersize=9,
+        markeredgecolor="white",
+        markeredgewidth=0.6,
+        zorder=7,
+    )
+
+
+def draw_time_marks(
+    axes: Axes,
+    path: Float[np.ndarray, "t 2"],
+    periods: Sequence[int],
+    period: float,
+    colour: str,
+    *,
+    dots: bool = True,
+    side: float = 1.0,
+) -> None:
+    """The time in seconds, and a dot, at these control periods of a path; `side` -1 labels its right."""
+    span = np.ptp(np.asarray([axes.get_xlim(), axes.get_ylim()]), axis=1).max()
+    last = None
+    for mark in periods:
+        if mark >= len(path):
+            continue
+        if dots:
+            axes.plot(
+                *path[mark],
+                "o",
+                color="white",
+                markeredgecolor=colour,
+                markersize=3.2,
+                markeredgewidth=0.9,
+                zorder=8,
+            )
+        # Where a robot stands still its labels would pile up.
+        if last is not None and np.hypot(*(path[mark] - last)) < 0.02 * span:
+            continue
+        last = path[mark]
+        ahead = path[min(mark + 1, len(path) - 1)] - path[max(mark - 1, 0)]
+        norm = np.hypot(*ahead)
+        aside = np.array([-ahead[1], ahead[0]]) / norm if norm > 0 else np.array([0.0, 1.0])
+        axes.annotate(
+            f"{mark * period:g}", path[mark], xytext=_at(9 * side * aside), textcoords="offset points",
+            fontsize=6.5, color=colour, ha="center", va="center", zorder=8, path_effects=_LABEL_HALO,
+        )  # fmt: skip
+
+
+def draw_evader_path(axes: Axes, trajectory: Trajectory, norm: Normalize) -> LineCollection:
+    """The evader's path; where the shield stepped in, thick and coloured by the size of the correction."""
+    path = np.asarray(trajectory.worlds.evader)
+    correction = np.asarray(trajectory.intervention)
+    segments = np.stack([path[:-1], path[1:]], axis=1)
+    axes.plot(*path.T, color=EVADER, linewidth=1.1, zorder=4)
+    stepped_in = correction > 1e-6
+    lines = LineCollection(
+        list(segments[stepped_in]), array=correction[stepped_in], cmap=correction_colours(), norm=norm,
+        linewidth=4.2, capstyle="round", zorder=3.9,
+    )  # fmt: skip
+    axes.add_collection(lines, autolim=False)
+    return lines
+
+
+@eqx.filter_jit
+def _composed_barrier(
+    scenario: Scenario, world: World, evaders: Float[Array, "n 2"], pursuit: bool
+) -> Float[Array, "n"]:
+    barrier = PursuitBarrier() if pursuit else RangeBarrier()
+    obstacle, none = ObstacleBarrier(), jnp.zeros((), evaders.dtype)
+
+    def value(evader: Array) -> Array:
+        side = lambda robot: barrier.recall(scenario, evader, robot, None)  # noqa: E731
+        to_pursuers = jax.vmap(lambda robot: barrier.value(scenario, evader, robot, side(robot)))(
+            world.pursuers
+        )
+        to_obstacles = jax.vmap(lambda robot: obstacle.value(scenario, evader, robot, none))(world.obstacles)
+        return jnp.min(jnp.concatenate([to_pursuers, to_obstacles]))
+
+    return jax.vmap(value)(evaders)
+
+
+def draw_barrier_levels(
+    axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = (0.1, 0.2, 0.3)
+) -> None:
+    """Level sets of the composed barrier h = min_i h_i over evader positions, all others held in place."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    x, y = np.linspace(left, right, 160), np.linspace(bottom, top, 160)
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    values = _composed_barrier(scenario, world, jnp.asarray(grid.reshape(-1, 2), dtype=float), pursuit)
+    heights = np.asarray(values).reshape(grid.shape[:2])
+    axes.contour(x, y, heights, levels=list(levels), colors="#9A9A9A", linewidths=0.5, zorder=0.5)
+    axes.contour(x, y, heights, levels=[0.0], colors=INK, linewidths=1.0, zorder=2.5)

@@ -1,0 +1,147 @@
+"""One look for all figures: fonts, sizes, and colours that colour-blind readers can tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from sidestep.learning.records import write_bytes
+
+# Okabe and Ito's palette, "Color universal design" (2008).
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, VERMILION, PURPLE, GREY = "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8A8A8A"
+
+EVADER, PURSUER, OBSTACLE, TARGET = BLUE, VERMILION, "#595959", GREEN
+INK, FAINT = "#222222", "#C8C8C8"
+
+OUTCOME_COLOURS = {"captured": VERMILION, "collided": PURPLE, "reached": GREEN, "timed_out": GREY}
+OUTCOME_MARKERS = {"captured": "X", "collided": "^", "reached": ".", "timed_out": "s"}
+OUTCOME_WORDS = {
+    "captured": "captured",
+    "collided": "collided",
+    "reached": "reached the target",
+    "timed_out": "timed out",
+    "cut": "cut short",
+}
+
+_SHIELD_COLOURS = {"none": GREY, "paper": ORANGE, "game": BLUE, "joint": GREEN}
+_SHIELD_WORDS = {
+    "none": "no shield",
+    "paper": "paper's shield",
+    "game": "game shield",
+    "joint": "joint shield",
+}
+_OTHERS = (PURPLE, SKY, VERMILION, BLACK)
+
+WIDTH = 7.0
+"""Full text width of a two-column page, inches."""
+_DPI = 200
+_MOST_BYTES = 300_000
+
+_SETTINGS: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#777777",
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "text.color": INK,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "lines.linewidth": 1.4,
+    "lines.solid_capstyle": "round",
+    "mathtext.fontset": "dejavusans",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+}
+
+
+def shield_colour(name: str, position: int = 0) -> str:
+    """The colour of a shield everywhere; one that is not ours gets one of the others by its position."""
+    return _SHIELD_COLOURS.get(name, _OTHERS[position % len(_OTHERS)])
+
+
+def shield_words(name: str) -> str:
+    """How captions call a shield."""
+    return _SHIELD_WORDS.get(name, f"{name} shield")
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Figures drawn in here look alike, whatever the user's matplotlib is set to."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_SETTINGS)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of this size in inches that no window system and no global state knows of."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def light_grid(axes: Axes, axis: Any = "both") -> None:
+    """Hairlines that guide the eye and no more."""
+    axes.grid(True, axis=axis, color="#E6E6E6", linewidth=0.6)
+
+
+def panel_titles(axes: Sequence[Axes], titles: Sequence[str]) -> None:
+    """Titles with the letters a, b, ... that captions refer to; no letter for a single panel."""
+    for index, (one, title) in enumerate(zip(axes, titles, strict=True)):
+        one.set_title(title if len(axes) == 1 else f"{chr(ord('a') + index)}   {title}")
+
+
+def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
+    """Write the figure as PNG and as PDF beside it; the suffix of `path`, if any, is replaced.
+
+    The same figure gives the same bytes: no dates inside. A PNG is made coarser until it stays below 300 kB.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
+    content = b""
+    for dpi in (_DPI, 160, 130, 100, 75):
+        content = _as_png(figure, dpi)
+        if len(content) < _MOST_BYTES:
+            break
+    write_bytes(png, content)
+    buffer = BytesIO()
+    figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
+    write_bytes(pdf, buffer.getvalue())
+    return png, pdf
+
+
+def _as_png(figure: Figure, dpi: int) -> bytes:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    return buffer.getvalue()

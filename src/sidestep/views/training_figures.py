@@ -1,0 +1,263 @@
+"""Figures of a training: returns and outcomes over episodes, and how many episodes were safe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from sidestep.learning.records import CONVERGENCE_RETURN, CONVERGENCE_WINDOW, converged_episode, moving_mean
+from sidestep.trials import interquartile_mean, wilson_interval
+from sidestep.views.runs import Run, by_shield
+from sidestep.views.style import (
+    INK,
+    OUTCOME_COLOURS,
+    OUTCOME_MARKERS,
+    OUTCOME_WORDS,
+    WIDTH,
+    house_style,
+    light_grid,
+    new_figure,
+    panel_titles,
+    save,
+    shield_colour,
+    shield_words,
+)
+
+PAPER_CONVERGED = 80
+PAPER_EPISODES = 200
+_MANY_RUNS = 6
+
+
+def reward_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
+    """Accumulated reward over training episodes, and below it how every episode ended.
+
+    Faint: each episode; thick: mean of the last 20, and over several seeds the interquartile mean of it with
+    the range of the seeds. A diamond marks convergence (mean of 20 at least 940). Writes PNG and PDF.
+    """
+    groups = by_shield(runs)
+    rows = [run for group in groups.values() for run in group]
+    with house_style():
+        row_height = 0.24 if len(rows) <= _MANY_RUNS else 0.16
+        raster_height = row_height * max(len(rows), 1) + 0.25
+        figure = new_figure(WIDTH, 2.9 + raster_height)
+        top, raster = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, raster_height])
+        for position, (shield, group) in enumerate(groups.items()):
+            colour, words = shield_colour(shield, position), shield_words(shield)
+            _draw_returns(top, group, colour, words, line=len(groups) == 1)
+        _finish_returns(top, rows)
+        _draw_outcomes(raster, rows)
+        panel_titles([top, raster], ["Accumulated reward per training episode", "How each episode ended"])
+        return save(figure, path)
+
+
+def _returns(run: Run) -> np.ndarray:
+    return np.array([float(episode["return"]) for episode in run.metrics])
+
+
+def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, *, line: bool) -> None:
+    curves = [_returns(run) for run in group]
+    several = len(group) > 1
+    label += f", {len(group)} seeds" if several else ""
+    for returns in curves:
+        episodes = np.arange(1, len(returns) + 1)
+        if several:
+            axes.plot(episodes, moving_mean(returns), color=colour, alpha=0.35, linewidth=0.7)
+        elif line:
+            axes.plot(episodes, returns, color=colour, alpha=0.3, linewidth=0.7)
+        else:
+            # The lines of several shields would hide each other: returns jump between 0 and 1000.
+            axes.scatter(episodes, returns, s=7, color=colour, alpha=0.45, linewidth=0)
+        closed = converged_episode(returns)
+        if closed is not None:
+            axes.plot(
+                closed, moving_mean(returns)[closed - 1], marker="D", markersize=5, color=colour,
+                markeredgecolor="white", markeredgewidth=0.8, zorder=5, linestyle="none",
+            )  # fmt: skip
+    shortest = min(len(returns) for returns in curves)
+    means = np.stack([moving_mean(returns[:shortest]) for returns in curves])
+    episodes = np.arange(1, shortest + 1)
+    middle = np.array([interquartile_mean(column) for column in means.T])
+    axes.plot(episodes, middle, color=colour, linewidth=2.0, label=label, zorder=4)
+    if several:
+        axes.fill_between(
+            episodes, means.min(axis=0), means.max(axis=0), color=colour, alpha=0.15, linewidth=0
+        )
+
+
+def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
+    longest = max((len(run.metrics) for run in runs), default=1)
+    light_grid(axes, "y")
+    axes.axhline(CONVERGENCE_RETURN, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.text(
+        1.005, CONVERGENCE_RETURN, f"{CONVERGENCE_RETURN:.0f}", transform=axes.get_yaxis_transform(),
+        va="center", fontsize=7,
+    )  # fmt: skip
+    if longest > PAPER_CONVERGED:
+        axes.axvline(PAPER_CONVERGED, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+        axes.text(
+            PAPER_CONVERGED,
+            0.03,
+            "the paper converged by here ",
+            transform=axes.get_xaxis_transform(),
+            fontsize=7,
+            ha="right",
+        )
+    axes.set_ylabel("accumulated reward")
+    axes.set_xlim(0, longest + 1)
+    handles, _ = axes.get_legend_handles_labels()
+    diamond = Line2D(
+        [], [], marker="D", linestyle="none", color=INK, markersize=4.5,
+        label=f"converged (mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f})",
+    )  # fmt: skip
+    axes.legend(
+        handles=[*handles, diamond], loc="lower right", ncols=1 if len(handles) < 4 else 2, frameon=True,
+        framealpha=0.85, edgecolor="none",
+    )  # fmt: skip
+
+
+def _draw_outcomes(axes: Axes, runs: Sequence[Run]) -> None:
+    many = len(runs) > _MANY_RUNS
+    for row, run in enumerate(runs):
+        for outcome, colour in OUTCOME_COLOURS.items():
+            episodes = [i + 1 for i, episode in enumerate(run.metrics) if episode["outcome"] == outcome]
+            size = {"reached": 2.5, "timed_out": 9.0}.get(outcome, 18.0) * (0.6 if many else 1.0)
+            axes.scatter(
+                episodes, [row] * len(episodes), s=size, marker=OUTCOME_MARKERS[outcome], color=colour,
+                linewidth=0, zorder=3 if outcome != "reached" else 2,
+            )  # fmt: skip
+    several_seeds = len(runs) > len({run.shield for run in runs})
+    labels = [run.shield + (f", seed {run.seed}" if several_seeds else "") for run in runs]
+    axes.set_yticks(range(len(runs)), labels, fontsize=6 if many else 7.5)
+    axes.set_ylim(len(runs) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("training episode")
+    handles = [
+        Line2D(
+            [], [], marker=OUTCOME_MARKERS[name], linestyle="none", color=colour, markeredgewidth=0,
+            markersize=5, label=OUTCOME_WORDS[name],
+        )
+        for name, colour in OUTCOME_COLOURS.items()
+    ]  # fmt: skip
+    axes.legend(
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2,
+        handletextpad=0.1, columnspacing=1.2,
+    )  # fmt: skip
+
+
+def safety_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """The paper's Table I, its own column first: episodes, safe episodes, ratio and its 95 % bounds.
+
+    Several seeds of a shield are pooled.
+    """
+    low, high = wilson_interval(PAPER_EPISODES, PAPER_EPISODES)
+    rows = [
+        {
+            "name": "the paper reports",
+            "shield": None,
+            "episodes": PAPER_EPISODES,
+            "safe": PAPER_EPISODES,
+            "captured": 0,
+            "collided": 0,
+            "ratio": 1.0,
+            "low": low,
+            "high": high,
+        }
+    ]
+    for shield, group in by_shield(runs).items():
+        outcomes = [episode["outcome"] for run in group for episode in run.metrics]
+        captured, collided = outcomes.count("captured"), outcomes.count("collided")
+        safe = len(outcomes) - captured - collided
+        low, high = wilson_interval(safe, len(outcomes))
+        rows.append(
+            {
+                "name": shield_words(shield),
+                "shield": shield,
+                "episodes": len(outcomes),
+                "safe": safe,
+                "captured": captured,
+                "collided": collided,
+                "ratio": safe / len(outcomes) if outcomes else None,
+                "low": low,
+                "high": high,
+            }
+        )
+    return rows
+
+
+def safety_table(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
+    """The number of safe episodes in training as a table, the paper's beside ours. Writes PNG and PDF."""
+    columns = safety_rows(runs)
+
+    def share(value: float | None) -> str:
+        return "–" if value is None else f"{100 * value:.1f} %"
+
+    lines = [
+        ("episodes", [str(column["episodes"]) for column in columns]),
+        ("safe episodes", [str(column["safe"]) for column in columns]),
+        ("   captured", [str(column["captured"]) for column in columns]),
+        ("   collided", [str(column["collided"]) for column in columns]),
+        ("safety ratio", [share(column["ratio"]) for column in columns]),
+        ("   95 % bounds", [f"{share(column['low'])[:-2]} – {share(column['high'])}" for column in columns]),
+    ]
+    with house_style():
+        height = 0.24
+        figure = new_figure(min(WIDTH, 1.6 + 1.35 * len(columns)), height * (len(lines) + 2.2))
+        axes = figure.add_subplot()
+        axes.set_axis_off()
+        axes.set_xlim(0, 1.2 + len(columns))
+        axes.set_ylim(len(lines) + 0.6, -1.0)
+        for index, column in enumerate(columns):
+            axes.text(2.1 + index, -0.35, column["name"], ha="right", va="center", weight="bold")
+        for row, (name, cells) in enumerate(lines):
+            quiet = "#555555" if name.startswith(" ") else INK
+            axes.text(0.02, row + 0.5, name, va="center", color=quiet)
+            for index, cell in enumerate(cells):
+                axes.text(2.1 + index, row + 0.5, cell, ha="right", va="center", color=quiet)
+        for y, width in ((-0.85, 1.2), (0.0, 0.6), (len(lines) + 0.1, 1.2)):
+            axes.plot([0, 1.2 + len(columns)], [y, y], color=INK, linewidth=width, clip_on=False)
+        return save(figure, path)
+
+
+def outcome_figure(evaluations: Mapping[str, Mapping[str, Any]], path: str | Path) -> tuple[Path, Path]:
+    """Shares of episodes captured, collided, timed out and reached per shield, with 95 % Wilson intervals.
+
+    **Arguments:** `evaluations` what `Evaluation.to_dict` gives, by shield. Writes PNG and PDF.
+    """
+    panels = (
+        ("captured", "Captured"),
+        ("collided", "Collided"),
+        ("timed_out", "Timed out"),
+        ("reached", "Reached"),
+    )
+    names = list(evaluations)
+    with house_style():
+        figure = new_figure(WIDTH, 0.95 + 0.27 * len(names))
+        axes = figure.subplots(1, len(panels), sharey=True)
+        for one, (outcome, title) in zip(axes, panels, strict=True):
+            most = 1.0
+            for row, name in enumerate(names):
+                report = evaluations[name]
+                rate, low, high = (100 * report[f"{outcome}_rate{end}"] for end in ("", "_low", "_high"))
+                colour = shield_colour(name, row)
+                one.plot([low, high], [row, row], color=colour, linewidth=2.2, alpha=0.5)
+                one.plot(rate, row, "o", color=colour, markersize=5)
+                one.annotate(
+                    f"{report[outcome]}", (rate, row), xytext=(0, 5), textcoords="offset points",
+                    ha="center", fontsize=6.5,
+                )  # fmt: skip
+                most = max(most, high)
+            one.set_xlim(-0.04 * most, 1.08 * most) if outcome != "reached" else None
+            one.set_xlabel("% of episodes")
+            one.set_title(title)
+            light_grid(one, "x")
+            one.tick_params(axis="y", length=0)
+            one.spines["left"].set_visible(False)
+        axes[0].set_yticks(range(len(names)), [shield_words(name) for name in names])
+        axes[0].set_ylim(len(names) - 0.5, -0.65)
+        return save(figure, path)

@@ -1,0 +1,310 @@
+"""Figures of one episode: paths with time marks, where the shield stepped in, barriers over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from sidestep.safety import Status
+from sidestep.trials import Trajectory
+from sidestep.views.scene import (
+    closest_period,
+    correction_colours,
+    draw_barrier_levels,
+    draw_capture_set,
+    draw_evader_path,
+    draw_obstacles,
+    draw_pursuer,
+    draw_target,
+    draw_time_marks,
+    mark_periods,
+    set_limits,
+    world_at,
+)
+from sidestep.views.style import (
+    EVADER,
+    INK,
+    OBSTACLE,
+    OUTCOME_COLOURS,
+    OUTCOME_WORDS,
+    PURSUER,
+    TARGET,
+    WIDTH,
+    house_style,
+    light_grid,
+    new_figure,
+    panel_titles,
+    save,
+    shield_words,
+)
+from sidestep.world import Scenario
+
+_BARRIER_TICKS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.0)
+_PURSUIT_SHIELDS = ("game", "joint")
+
+
+def trajectory_figure(
+    scenario: Scenario,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    shield: str = "",
+    title: str | None = None,
+    moment: float | None = None,
+) -> tuple[Path, Path]:
+    """The paths of evader, pursuers and obstacles, and below them barriers and corrections over time.
+
+    **Arguments:** `shield` the name of the shield used, for words and for which barrier's level sets are
+    drawn; `moment` the time (s) at which pursuers' capture sets, obstacles and level sets are drawn: that of
+    the closest approach if not given.
+
+    Writes PNG and PDF; returns their paths.
+    """
+    period = closest_period(trajectory)
+    if moment is not None:
+        period = int(np.clip(round(moment / float(scenario.control_period)), 0, trajectory.length))
+    with house_style():
+        low, high = _extent(trajectory)
+        spans = high - low + 2 * _margin(scenario)
+        # As high as the scene needs at full width, within reason.
+        scene_height = float(np.clip((WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
+        figure = new_figure(WIDTH, scene_height + 3.3)
+        scene, key, barriers, corrections = figure.subplots(
+            4, 1, height_ratios=[scene_height + 0.4, 0.4, 1.3, 0.85]
+        )
+        norm = _correction_norm(scenario)
+        draw_scene(scene, scenario, trajectory, norm, shield=shield, period=period)
+        _scene_legend(key, trajectory)
+        _draw_barriers(barriers, scenario, trajectory, period)
+        _draw_corrections(corrections, scenario, trajectory, norm, period)
+        barriers.sharex(corrections)
+        barriers.tick_params(axis="x", labelbottom=False)
+        words = f"{shield_words(shield)}: " if shield else ""
+        duration = trajectory.length * float(scenario.control_period)
+        heading = title or f"{words}{OUTCOME_WORDS[trajectory.outcome]} after {duration:.1f} s"
+        panel_titles(
+            [scene, barriers, corrections],
+            [
+                heading[:1].upper() + heading[1:],
+                "Barriers: how far from capture and collision",
+                "How far the shield changed the velocity (colours as above)",
+            ],
+        )
+        return save(figure, path)
+
+
+def scenes_figure(
+    scenario: Scenario, trajectories: Mapping[str, Trajectory], path: str | Path
+) -> tuple[Path, Path]:
+    """The same scene under several shields, one below the other. Writes PNG and PDF.
+
+    **Arguments:** `trajectories` by name of shield.
+    """
+    with house_style():
+        norm = _correction_norm(scenario)
+        extents = [_extent(trajectory) for trajectory in trajectories.values()]
+        low = np.min([extent[0] for extent in extents], axis=0)
+        high = np.max([extent[1] for extent in extents], axis=0)
+        spans = high - low + 2 * _margin(scenario)
+        height = float(np.clip((WIDTH - 1.3) * spans[1] / spans[0], 1.5, 4.0))
+        count = len(trajectories)
+        figure = new_figure(WIDTH, (height + 0.35) * count + 0.6)
+        *axes, key = figure.subplots(count + 1, 1, height_ratios=[height + 0.35] * count + [0.4])
+        titles = []
+        for one, (shield, trajectory) in zip(axes, trajectories.items(), strict=True):
+            draw_scene(one, scenario, trajectory, norm, shield=shield, limits=(low, high))
+            duration = trajectory.length * float(scenario.control_period)
+            words = f"{shield_words(shield)}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.1f} s"
+            titles.append(words[:1].upper() + words[1:])
+        for one in axes[:-1]:
+            one.set_xlabel("")
+            one.tick_params(labelbottom=False)
+        _scene_legend(key, next(iter(trajectories.values())))
+        bar = figure.colorbar(
+            ScalarMappable(norm, correction_colours()), ax=[*axes, key], shrink=0.4, aspect=25, pad=0.015
+        )
+        bar.set_label("correction, m/s")
+        bar.outline.set_visible(False)  # type: ignore[operator]
+        panel_titles(axes, titles)
+        return save(figure, path)
+
+
+def _correction_norm(scenario: Scenario) -> Normalize:
+    """From nothing to a full reversal, so that colours mean the same in every figure."""
+    return Normalize(0.0, 2.0 * float(scenario.evader_speed))
+
+
+def _margin(scenario: Scenario) -> float:
+    return max(float(scenario.capture_distance), float(scenario.collision_distance)) + 0.08
+
+
+def _extent(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    worlds = trajectory.worlds
+    points = np.concatenate(
+        [
+            np.asarray(worlds.evader),
+            np.asarray(worlds.pursuers)[..., :2].reshape(-1, 2),
+            np.asarray(worlds.obstacles)[..., :2].reshape(-1, 2),
+            np.asarray(worlds.target)[:1],
+        ]
+    )
+    return points.min(axis=0), points.max(axis=0)
+
+
+def draw_scene(
+    axes: Axes,
+    scenario: Scenario,
+    trajectory: Trajectory,
+    norm: Normalize,
+    *,
+    shield: str = "",
+    period: int | None = None,
+    limits: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:
+    """Everything that moved, with time marks; capture and level sets at control period `period`."""
+    period = closest_period(trajectory) if period is None else period
+    world = world_at(trajectory, period)
+    set_limits(axes, np.stack(limits if limits is not None else _extent(trajectory)), _margin(scenario))
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+    draw_barrier_levels(axes, scenario, world, pursuit=shield in _PURSUIT_SHIELDS)
+    draw_obstacles(axes, scenario, trajectory, period)
+    draw_target(axes, scenario, np.asarray(trajectory.worlds.target[0]))
+    draw_evader_path(axes, trajectory, norm)
+
+    length = float(scenario.control_period)
+    marks = mark_periods(trajectory.length * length, length)
+    paths = np.asarray(trajectory.worlds.pursuers)
+    for index in range(paths.shape[1]):
+        draw_capture_set(axes, scenario, paths[period, index])
+        axes.plot(*paths[:, index, :2].T, color=PURSUER, linewidth=1.3, zorder=4)
+        draw_time_marks(axes, paths[:, index, :2], marks, length, PURSUER, dots=False)
+        for mark in (0, *marks):
+            draw_pursuer(axes, paths[mark, index])
+        draw_pursuer(axes, paths[period, index], size=0.11)
+    evader = np.asarray(trajectory.worlds.evader)
+    draw_time_marks(axes, evader, marks, length, EVADER)
+    axes.plot(
+        *evader[0], "o", color=EVADER, markersize=5, markeredgecolor="white", markeredgewidth=0.7, zorder=7
+    )
+    axes.plot(
+        *evader[period], "o", color=EVADER, markersize=5.5, markeredgecolor=INK, markeredgewidth=0.9, zorder=7
+    )
+    if trajectory.outcome in ("captured", "collided"):
+        colour = OUTCOME_COLOURS[trajectory.outcome]
+        axes.plot(
+            *evader[-1],
+            "X",
+            color=colour,
+            markersize=9,
+            markeredgecolor="white",
+            markeredgewidth=0.8,
+            zorder=9,
+        )
+
+
+def _scene_legend(axes: Axes, trajectory: Trajectory) -> None:
+    """The key, in axes of its own, where it cannot cover anything."""
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
+        Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
+        Line2D([], [], color=PURSUER, linewidth=0.8, linestyle=(0, (3, 2)), label="capture set K"),
+        Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
+    ]
+    if trajectory.worlds.obstacles.shape[1]:
+        handles.append(Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
+    handles += [
+        Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
+        Line2D([], [], color="#9A9A9A", linewidth=0.6, label="h = 0.1, 0.2, 0.3 m"),
+        Line2D([], [], color=TARGET, marker="*", linestyle="none", markersize=8, label="target"),
+    ]
+    axes.set_axis_off()
+    axes.legend(handles=handles, loc="center", ncols=4, columnspacing=1.4, handletextpad=0.5, fontsize=7)
+
+
+def _times(scenario: Scenario, trajectory: Trajectory) -> np.ndarray:
+    return np.arange(trajectory.length) * float(scenario.control_period)
+
+
+def _shade_infeasible(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
+    """Background where the shield could not satisfy its rows."""
+    times, length = _times(scenario, trajectory), float(scenario.control_period)
+    stuck = np.asarray(trajectory.status) == Status.INFEASIBLE
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(int)))
+    for begin, end in edges.reshape(-1, 2):
+        axes.axvspan(
+            float(times[begin]), float(times[end - 1]) + length, color=PURSUER, alpha=0.18, linewidth=0
+        )
+
+
+def _draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory, period: int) -> None:
+    times, values = _times(scenario, trajectory), np.asarray(trajectory.barriers)
+    pursuers = trajectory.worlds.pursuers.shape[1]
+    light_grid(axes, "y")
+    _shade_infeasible(axes, scenario, trajectory)
+    for index in range(values.shape[1]):
+        chased = index < pursuers
+        colour, word = (PURSUER, "pursuer") if chased else (OBSTACLE, "obstacle")
+        first = index in (0, pursuers)
+        axes.plot(
+            times, values[:, index], color=colour, linewidth=1.3, label=f"h towards {word}" if first else None
+        )
+    axes.axhline(0.0, color=INK, linewidth=1.0)
+    finite = values[np.isfinite(values)]
+    highest, lowest = float(np.max(finite, initial=0.1)), float(np.min(finite, initial=0.0))
+    # Margins of millimetres and distances of metres in one strip.
+    axes.set_yscale(
+        "function",
+        functions=(lambda h: np.sign(h) * np.sqrt(np.abs(h)), lambda root: np.sign(root) * root**2),
+    )
+    axes.set_ylim(min(-0.01 * highest, 1.3 * lowest), 1.1 * highest)
+    ticks = [tick for tick in _BARRIER_TICKS if tick <= 1.1 * highest]
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_ylabel("h, m (√ scale)")
+    now = period * float(scenario.control_period)
+    axes.axvline(now, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    late = now > 0.8 * trajectory.length * float(scenario.control_period)
+    axes.annotate(
+        "drawn above", (now, 1.0), xycoords=axes.get_xaxis_transform(), xytext=(-3 if late else 3, -2),
+        textcoords="offset points", ha="right" if late else "left", va="top", fontsize=6.5,
+    )  # fmt: skip
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, borderpad=0.1, borderaxespad=0.0)
+
+
+def _draw_corrections(
+    axes: Axes, scenario: Scenario, trajectory: Trajectory, norm: Normalize, period: int
+) -> None:
+    times, correction = _times(scenario, trajectory), np.asarray(trajectory.intervention)
+    length = float(scenario.control_period)
+    light_grid(axes, "y")
+    _shade_infeasible(axes, scenario, trajectory)
+    axes.bar(
+        times,
+        correction,
+        width=length,
+        align="edge",
+        color=correction_colours()(norm(correction)),
+        linewidth=0,
+    )
+    axes.step(times, correction, where="post", color=INK, linewidth=0.5)
+    axes.axvline(period * length, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.set_ylim(0.0, 2.1 * float(scenario.evader_speed))
+    axes.set_xlim(0.0, max(trajectory.length, 1) * length)
+    axes.set_ylabel("m/s")
+    axes.set_xlabel("time, s")
+    if np.any(np.asarray(trajectory.status) == Status.INFEASIBLE):
+        axes.legend(
+            handles=[Patch(facecolor=PURSUER, alpha=0.25, label="no velocity satisfies all rows")],
+            loc="upper left", frameon=True, framealpha=0.85, edgecolor="none", borderpad=0.2,
+        )  # fmt: skip
+    if np.max(correction, initial=0.0) <= 1e-6:
+        axes.text(
+            0.5, 0.45, "it never did", transform=axes.transAxes, ha="center", va="center", color="#777777"
+        )
