@@ -24,6 +24,8 @@ from sidestep.safety.status import Status
 _TOLERANCE = 16.0
 _ROUNDING = 8.0
 _UNROLLED = 4
+# Distances squared are at most 5.
+_UNLIKELY = 8.0
 _REJECTED = 16.0
 
 
@@ -225,23 +227,24 @@ def _closest(
         x, y, c, half = (jnp.concatenate([entry, entry]) for entry in (x, y, c, half))
         count = rows.c.shape[0]
         t = jnp.concatenate([half[:count], -half[count:]])
-        candidate = jnp.abs(c) <= 1.0 + tolerance(c.dtype)
+        likely = jnp.ones_like(c, bool)
     else:
         low, minus_high = _worst(limits, (x, y, c), rows)
         allowed = jnp.minimum(jnp.maximum(x * wish[1] - y * wish[0], low), -minus_high)
         # The disc last: should the limits contradict each other, `violation` below will show it.
         t = jnp.clip(allowed, -half, half)
-        # Some row that the start violates is active at the answer, so the others need not be tried.
-        candidate = short_of_start > 0.0
+        # Some row that the start violates is active at the answer; the others only help against rounding.
+        likely = short_of_start > 0.0
     violation = jnp.maximum(_worst(miss, (x, y, c, t), rows), jnp.abs(c) - 1.0)
     ahead = c - x * start[0] - y * start[1]
     aside = t - (x * start[1] - y * start[0])
     distance = ahead**2 + aside**2 + weight * (1.0 - c**2 - t**2)
-    key = jnp.where(violation <= tolerance(c.dtype), distance, _REJECTED + violation)
-    key = jnp.where(candidate, key, jnp.inf)
+    key = jnp.where(likely, distance, _UNLIKELY + distance)
+    key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + violation)
     chosen = jnp.arange(key.shape[0]) == jnp.argmin(key)
     pick = lambda entry: jnp.sum(jnp.where(chosen, entry, 0.0))  # noqa: E731
 
+    c = jnp.clip(c, -1.0, 1.0)  # whatever rounding did, the speed limit holds
     missed = jnp.max(short_of_start)
     stay = (missed <= tolerance(c.dtype)) | (_REJECTED + missed <= jnp.min(key))
     return _Answer(
