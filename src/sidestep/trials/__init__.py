@@ -1,6 +1,6 @@
 """What was measured? Batch evaluation, statistics, recorded episodes."""
 
-from sidestep.trials.captures import Capture, count_causes, explain_capture
+from sidestep.trials.captures import Capture, count_causes, examine_captures, explain_capture
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.keys import episode_key
 from sidestep.trials.monte_carlo import evaluate
@@ -21,6 +21,7 @@ __all__ = [
     "count_causes",
     "episode_key",
     "evaluate",
+    "examine_captures",
     "explain_capture",
     "interquartile_mean",
     "load_trajectory",

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
-from sidestep.trials.rollout import Trajectory
+from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.keys import episode_key
+from sidestep.trials.rollout import Trajectory, rollout
 from sidestep.world import Scenario
 
 CAUSES = ("reversing", "head-on", "other")
-"""`reversing`: the pursuer drove backwards, the row took it to be leaving. `head-on`: no velocity satisfied the
-row. `other`: neither, in the end."""
+"""`reversing`: the pursuer drove backwards, which the row took for leaving. `head-on`: no velocity satisfied
+the row. `other`: neither, in the end."""
 
 _LAST_SECONDS = 0.5
 
@@ -37,7 +40,6 @@ class Capture:
     expected: Float[np.ndarray, "t"]
     needed: Float[np.ndarray, "t"]
     moved: Float[np.ndarray, "t"]
-
 
 
 def explain_capture(scenario: Scenario, trajectory: Trajectory) -> Capture:
@@ -72,3 +74,33 @@ def count_causes(scenario: Scenario, trajectories: Sequence[Trajectory]) -> dict
     """How many of these captures had which of `CAUSES`."""
     causes = [explain_capture(scenario, trajectory).cause for trajectory in trajectories]
     return {cause: causes.count(cause) for cause in CAUSES}
+
+
+def examine_captures(
+    scenario: Scenario,
+    policy: Any,
+    shield: Any,
+    pursuer: Any,
+    evaluation: Evaluation,
+    key: PRNGKeyArray | int,
+    *,
+    most: int = 60,
+) -> tuple[dict[str, int], Trajectory | None]:
+    """Run the captures of an evaluation again, at most the first `most`, and see how they came about.
+
+    **Arguments:** those that `evaluate` was called with.
+
+    **Returns** how many had which of `CAUSES`, and one capture of the most frequent cause that took at least
+    three seconds if there is one (None without captures).
+    """
+    numbers = evaluation.numbers_of("captured")[:most]
+    found = [rollout(scenario, policy, shield, pursuer, episode_key(key, int(number))) for number in numbers]
+    # Rounding may differ between one episode and a batch, and an episode near the edge end otherwise.
+    found = [trajectory for trajectory in found if trajectory.outcome == "captured"]
+    counts = count_causes(scenario, found)
+    if not found:
+        return counts, None
+    usual = max(CAUSES, key=lambda cause: counts[cause])
+    typical = [trajectory for trajectory in found if explain_capture(scenario, trajectory).cause == usual]
+    lasting = 3.0 / float(scenario.control_period)
+    return counts, next((trajectory for trajectory in typical if trajectory.length >= lasting), typical[0])

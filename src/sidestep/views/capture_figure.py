@@ -157,7 +157,7 @@ def _draw_velocity_plane(axes: Axes, scenario: Scenario, trajectory: Trajectory,
     if np.hypot(*(nominal - action)) > 1e-3:
         _arrow(axes, np.zeros(2), nominal, "#999999")
         axes.annotate(
-            "nominal", nominal, xytext=(3, 5), textcoords="offset points", fontsize=7, color="#777777"
+            "nominal", tuple(nominal), xytext=(3, 5), textcoords="offset points", fontsize=7, color="#777777"
         )
     _arrow(axes, np.zeros(2), action, INK, 1.8)
     axes.annotate(

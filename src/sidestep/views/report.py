@@ -211,8 +211,8 @@ def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> 
         "outcome": OUTCOME_WORDS[scene.outcome],
         "seconds": scene.length * float(scenario.control_period),
         "corrected": float(np.mean(corrected)) if len(corrected) else 0.0,
-        "closest": float(np.min(np.asarray(scene.events.pursuer_clearance))),
-        "clear": clear if np.isfinite(clear) else None,
+        "to_capture": float(np.min(np.asarray(scene.events.pursuer_clearance))),
+        "to_collision": clear if np.isfinite(clear) else None,
     }
 
 

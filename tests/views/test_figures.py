@@ -1,0 +1,152 @@
+"""Hazards of figures: blank or huge files, crashes on short or odd runs, lines nobody can tell apart."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from PIL import Image
+
+from sidestep.trials import wilson_interval
+from sidestep.views import (
+    capture_figure,
+    outcome_figure,
+    reward_figure,
+    safety_rows,
+    safety_table,
+    scenes_figure,
+    trajectory_figure,
+)
+from sidestep.views.scene import capture_set_outline, mark_periods
+from sidestep.views.style import OUTCOME_COLOURS, OUTCOME_MARKERS, shield_colour
+from sidestep.world import Scenario
+from sidestep.world.capture_geometry import capture_set_distance
+
+PAPER = Scenario()
+
+
+def assert_fine(written):
+    """A PNG that shows something and is small enough, and a PDF."""
+    png, pdf = written
+    assert png.stat().st_size < 300_000
+    pixels = np.asarray(Image.open(png).convert("L"))
+    assert min(pixels.shape) > 200
+    assert 0.005 < np.mean(pixels < 200) < 0.6
+    assert pdf.read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("count", [0, 1, 19, 20, 200])
+def test_reward_figure_of_a_run_of_any_length(tmp_path, count, run_of):
+    mixed = [("captured", "collided", "reached", "timed_out")[i % 4] for i in range(count)]
+    assert_fine(reward_figure([run_of(outcomes=mixed)], tmp_path / "reward"))
+
+
+def test_reward_figure_of_many_seeds_of_different_length(tmp_path, run_of):
+    runs = [
+        run_of(shield, ("reached",) * (25 + 10 * seed), seed)
+        for shield in ("none", "paper", "game", "ours")
+        for seed in range(3)
+    ]
+    assert_fine(reward_figure(runs, tmp_path / "reward.png"))
+
+
+def test_same_data_give_the_same_files(tmp_path, run_of):
+    first = reward_figure([run_of()], tmp_path / "a")
+    second = reward_figure([run_of()], tmp_path / "b")
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+def test_users_own_matplotlib_settings_are_left_alone_and_ignored(tmp_path, run_of):
+    plain = reward_figure([run_of()], tmp_path / "plain")
+    with matplotlib.rc_context({"font.size": 31.0, "axes.facecolor": "red"}):
+        before = dict(matplotlib.rcParams)
+        styled = reward_figure([run_of()], tmp_path / "styled")
+        assert dict(matplotlib.rcParams) == before
+    assert plain[0].read_bytes() == styled[0].read_bytes()
+
+
+def test_outcomes_differ_in_shape_as_well_as_in_colour():
+    assert len(set(OUTCOME_MARKERS.values())) == len(set(OUTCOME_COLOURS.values())) == 4
+    assert len({shield_colour(name) for name in ("none", "paper", "game", "joint")}) == 4
+
+
+def test_safety_table_counts_what_the_metrics_say(tmp_path, run_of):
+    runs = [
+        run_of("paper", ["captured"] * 3 + ["collided"] + ["reached"] * 6, seed=0),
+        run_of("paper", ["timed_out"] * 10, seed=1),
+        run_of("game", []),
+    ]
+    paper_reports, paper_shield, game = safety_rows(runs)
+    assert paper_reports["safe"] == paper_reports["episodes"] == 200
+    assert paper_reports["low"] < 0.99
+    counts = [paper_shield[name] for name in ("episodes", "safe", "captured", "collided")]
+    assert counts == [20, 16, 3, 1]
+    assert (paper_shield["low"], paper_shield["high"]) == wilson_interval(16, 20)
+    assert game["ratio"] is None
+    assert_fine(safety_table(runs, tmp_path / "safety"))
+
+
+def test_outcome_figure_shows_zero_and_all(tmp_path):
+    evaluations = {}
+    for shield, captured in (("none", 100), ("game", 0)):
+        evaluations[shield] = report = {}
+        counts = {"captured": captured, "collided": 0, "timed_out": 0, "reached": 100 - captured}
+        for name, count in counts.items():
+            low, high = wilson_interval(count, 100)
+            report |= {
+                name: count,
+                f"{name}_rate": count / 100,
+                f"{name}_rate_low": low,
+                f"{name}_rate_high": high,
+            }
+    assert_fine(outcome_figure(evaluations, tmp_path / "outcomes"))
+
+
+@pytest.mark.parametrize("shield", ["", "paper", "game"])
+def test_trajectory_figure(tmp_path, shield, chase):
+    assert_fine(trajectory_figure(PAPER, chase(), tmp_path / "scene", shield=shield))
+
+
+@pytest.mark.parametrize("obstacles, pursuers, steps", [(0, 1, 400), (3, 2, 400), (1, 1, 1)])
+def test_trajectory_figure_of_any_company_and_length(tmp_path, obstacles, pursuers, steps, chase):
+    trajectory = chase(obstacles=obstacles, pursuers=pursuers, steps=steps)
+    assert_fine(trajectory_figure(PAPER, trajectory, tmp_path / "scene", moment=1e9))
+
+
+def test_trajectory_with_an_unknown_world_can_be_drawn(tmp_path, chase):
+    trajectory = chase()
+    unknown = replace(trajectory, barriers=trajectory.barriers.at[3].set(-jnp.inf))
+    assert_fine(trajectory_figure(PAPER, unknown, tmp_path / "scene"))
+
+
+def test_scenes_figure(tmp_path, chase):
+    assert_fine(scenes_figure(PAPER, {"none": chase(), "game": chase(steps=50)}, tmp_path / "scenes"))
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("gap", [0.002, 0.15])
+def test_capture_figure(tmp_path, reverse, gap, chase):
+    assert_fine(capture_figure(PAPER, chase(reverse=reverse, gap=gap), tmp_path / "capture"))
+
+
+def test_capture_figure_of_no_capture_is_refused(tmp_path, chase):
+    with pytest.raises(ValueError, match="not in a capture"):
+        capture_figure(PAPER, chase(steps=5), tmp_path / "capture")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("evader_speed", [0.05, 0.1574, 0.2, 0.3])
+def test_drawn_capture_set_is_the_barriers_zero_level(evader_speed):
+    scenario = Scenario(evader_speed=evader_speed)
+    outline = jnp.asarray(capture_set_outline(scenario), dtype=float)
+    h = jax.vmap(lambda z: capture_set_distance(z, scenario.usable_angle, scenario.capture_distance))(outline)
+    assert np.allclose(h, 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("duration", [0.05, 0.9, 3.6, 39.3, 250.0, 5000.0])
+def test_time_marks_are_few_and_inside_the_episode(duration):
+    marks = mark_periods(duration, 0.05)
+    assert len(marks) <= 17
+    assert all(0 < mark <= round(duration / 0.05) for mark in marks)

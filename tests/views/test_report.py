@@ -1,0 +1,154 @@
+"""Hazards of the report: it needs the network, contradicts the data, or breaks on a half-done run."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+
+from sidestep.learning.records import RunError, append_metrics, create_run, write_json
+from sidestep.trials import save_trajectory, wilson_interval
+from sidestep.views import load_run, write_report
+
+
+class Links(HTMLParser):
+    """Everything a browser would load, and the text it would show."""
+
+    def __init__(self):
+        super().__init__()
+        self.loads, self.tags, self.text = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        values = dict(attrs)
+        self.loads += [values[name] for name in ("src", "href", "srcset", "data", "poster") if name in values]
+        if tag == "img":
+            assert values.get("alt")
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def read(path):
+    page = Links()
+    page.feed(path.read_text(encoding="utf-8"))
+    page.words = re.sub(r"\s+", " ", " ".join(page.text))
+    return page
+
+
+def evaluation(captured=12):
+    counts = {
+        "captured": captured,
+        "collided": 1,
+        "timed_out": 0,
+        "reached": 99 - captured,
+        "safe": 99 - captured,
+    }
+    report = {"episodes": 100, "reach_time_median": None, "min_obstacle_clearance": None}
+    for name, count in counts.items():
+        low, high = wilson_interval(count, 100)
+        report |= {
+            name: count,
+            f"{name}_rate": count / 100,
+            f"{name}_rate_low": low,
+            f"{name}_rate_high": high,
+        }
+    rates = ("intervention_rate", "infeasible_rate", "mean_correction", "min_pursuer_clearance")
+    return report | dict.fromkeys(rates, 0.01)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, chase, run_of):
+    """A report with everything in it."""
+    paper = replace(
+        run_of("paper", ["captured"] * 4 + ["reached"] * 30),
+        evaluation=evaluation() | {"capture_causes": {"reversing": 3, "head-on": 8, "other": 0}},
+        untrained_evaluation=evaluation(30),
+        scene=chase(),
+        untrained_scene=chase(),
+        capture=chase(reverse=True),
+    )
+    game = replace(run_of("game"), evaluation=evaluation(0), scene=chase(steps=60))
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    return write_report([game, paper], path, command="sidestep reproduce --seed 0 & <now>")
+
+
+def test_report_loads_nothing_from_anywhere(whole):
+    page = read(whole)
+    assert page.loads
+    assert all(load.startswith("data:image/png;base64,") for load in page.loads)
+    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
+    source = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", whole.read_text())
+    assert "http" not in source
+    assert "url(" not in source
+    assert "@import" not in source
+
+
+def test_pictures_in_the_report_are_whole(whole):
+    page = read(whole)
+    assert len(page.loads) == 6
+    for load in page.loads:
+        picture = base64.b64decode(load.split(",")[1], validate=True)
+        assert picture.startswith(b"\x89PNG")
+        assert picture.endswith(b"IEND\xaeB`\x82")
+
+
+def test_report_says_what_the_data_say(whole):
+    words = read(whole).words
+    assert "30 / 34" in words
+    assert "8 because the pursuer came straight on" in words
+    assert "3 because the pursuer drove backwards" in words
+    assert "0.0355" in words
+    assert "0.20078 m" in words
+    assert "The pursuer reverses" in words
+    assert words.index("Paper's shield") < words.index("Game shield")
+
+
+def test_report_escapes_what_it_shows(tmp_path, run_of):
+    run = run_of()
+    config = {**run.config, "pursuer": "<script>alert(1)</script>"}
+    path = write_report([replace(run, config=config)], tmp_path / "r.html", command="a && <b>")
+    text = path.read_text()
+    assert "<script>" not in text
+    assert "&lt;script&gt;" in text
+    assert "a &amp;&amp; &lt;b&gt;" in text
+
+
+def test_figures_are_left_beside_the_report_in_both_formats(whole):
+    names = {path.name for path in (whole.parent / "figures").iterdir()}
+    for figure in ("reward", "safety", "outcomes", "capture", "test-scene-paper", "test-scene-game"):
+        assert {f"{figure}.png", f"{figure}.pdf"} <= names
+
+
+def test_report_of_a_run_folder(tmp_path, chase, run_of):
+    run = run_of("game", ["reached"] * 5)
+    folder = create_run(tmp_path / "run", {**run.config, "episodes": 200, "version": "0.1.0", "learner": {}})
+    append_metrics(folder, run.metrics)
+    unfinished = load_run(folder)
+    assert unfinished.summary["episodes"] == 5
+    assert unfinished.evaluation is None
+    write_json(folder / "evaluation.json", evaluation(0))
+    save_trajectory(folder / "test_scene.npz", chase(steps=40))
+    path = write_report([folder], folder / "report.html")
+    assert "5 / 5" in read(path).words
+    assert json.loads((folder / "config.json").read_text())["shield"] == "game"
+
+
+def test_run_without_an_episode_gives_a_report(tmp_path, run_of):
+    assert "0 / 0" in read(write_report([run_of(outcomes=[])], tmp_path / "r.html")).words
+
+
+def test_several_seeds_are_pooled(tmp_path, run_of):
+    runs = [run_of("game", ["reached"] * 25, seed=seed) for seed in range(4)]
+    words = read(write_report(runs, tmp_path / "r.html")).words
+    assert "100 / 100" in words
+    assert "4 of 4 seeds, at 20, 20, 20, 20" in words
+
+
+def test_folder_without_a_run_is_named(tmp_path):
+    with pytest.raises(RunError, match="holds no run"):
+        write_report([tmp_path], tmp_path / "r.html")
+    with pytest.raises(ValueError, match="at least one run"):
+        write_report([], tmp_path / "r.html")
