@@ -105,7 +105,7 @@ class Reproduce:
 class Report:
     """Write the figures and the self-contained HTML report of one or several runs."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Run folders, or the folder of a reproduction."""
     out: Path | None = None
     """HTML file to write; report.html in the first folder by default."""
@@ -200,7 +200,7 @@ def reproduce(command: Reproduce, console: Console) -> int:
     from sidestep.learning import make_options
     from sidestep.learning.records import read_summary
     from sidestep.trials.reproduction import reproduce as run_study
-    from sidestep.views.report import write_study_report
+    from sidestep.views import write_report
     from sidestep.world import load_scenario
 
     try:
@@ -221,7 +221,11 @@ def reproduce(command: Reproduce, console: Console) -> int:
         console.print(f"Interrupted. Continue with: sidestep reproduce --out {command.out} --resume")
         return 130
     console.print(comparison_table(studies))
-    report = write_study_report(command.out, studies)
+    report = write_report(
+        [study.folder for study in studies],
+        command.out / "report.html",
+        command=f"sidestep reproduce --seed {command.seed}",
+    )
     _write_json(command.json, read_summary(command.out))
     console.print(f"Report with figures: {report}")
     return 0
@@ -275,9 +279,15 @@ def comparison_table(studies: list[ShieldStudy]) -> Any:
 
 def report(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
-    from sidestep.views.report import write_report
+    from sidestep.learning.records import open_run
+    from sidestep.views import write_report
 
-    console.print(f"Report with figures: {write_report(command.runs, command.out)}")
+    folders: list[Path] = []
+    for folder in command.runs:
+        study = open_run(folder).get("study")
+        folders += [folder] if study is None else [folder / shield for shield in study]
+    path = command.out or command.runs[0] / "report.html"
+    console.print(f"Report with figures: {write_report(folders, path)}")
     return 0
 
 

@@ -32,7 +32,7 @@ def test_study_leaves_everything_it_reports(study):
     assert game.training["episodes"] == 2
     assert game.trained["episodes"] == game.untrained["episodes"] == 8
     assert game.scene_trained.length <= 60
-    for name in ("policy.npz", "evaluation.json", "evaluation_untrained.json", "scene_trained.npz"):
+    for name in ("policy.npz", "evaluation.json", "evaluation_untrained.json", "test_scene.npz"):
         assert (out / "game" / name).is_file()
 
 

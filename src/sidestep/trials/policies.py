@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, real
 from sidestep.learning.control_step import decision_steps_of
-from sidestep.world import Scenario, goal_seeking, goal_seeking_world, observe
+from sidestep.world import Scenario, goal_seeking, goal_seeking_world, observation_size
 
 GOAL_SEEKING = "goal-seeking"
 _WRONG_SHAPE = "a policy must answer one observation with an action of shape (2,), not {}"
@@ -69,7 +69,7 @@ def as_policy(policy: Any, scenario: Scenario) -> Callable[..., Any]:
     if not callable(policy):
         raise TypeError(f"a policy is a callable (observation) -> action in [-1, 1]^2; got {policy!r}")
     decision_steps = decision_steps_of(policy)
-    observation = observe(scenario, scenario.reset(jax.random.key(0)))
+    observation = real(np.zeros(observation_size(scenario)))
     traced = _traced_answer(policy, observation)
     if traced is None:
         _host_action(policy, np.array(observation))

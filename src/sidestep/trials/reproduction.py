@@ -12,7 +12,7 @@ import sidestep
 from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield
-from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.captures import examine_captures
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import GOAL_SEEKING
 from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
@@ -87,9 +87,9 @@ def _quiet(label: str) -> AbstractContextManager[Callable[..., None]]:
     return nullcontext(lambda *_: None)
 
 
-def _measured(path: Path, run: Callable[[], Evaluation]) -> dict[str, Any]:
+def _measured(path: Path, run: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     if not path.exists():
-        records.write_json(path, run().to_dict())
+        records.write_json(path, run())
     return records.read_json(path)
 
 
@@ -147,6 +147,7 @@ def reproduce(
         records.create_run(out, config)
 
     scene = test_scene_of(scenario)
+    evaluation_key = seed + 1_000_000
     studies = []
     for shield in shields:
         folder = out / shield
@@ -161,11 +162,18 @@ def reproduce(
                 raise KeyboardInterrupt
         policy = load_policy(folder)
 
-        def measure(policy: Any, label: str, shield: str = shield) -> Evaluation:
+        def measure(policy: Any, label: str, shield: str = shield, folder: Path = folder) -> dict[str, Any]:
             with count_progress(f"{shield} shield, {label}") as show:
-                return evaluate(
-                    scenario, policy, shield, pursuer, evaluation_episodes, seed + 1_000_000, progress=show
+                result = evaluate(
+                    scenario, policy, shield, pursuer, evaluation_episodes, evaluation_key, progress=show
                 )
+            figures = result.to_dict()
+            if policy is not GOAL_SEEKING:
+                causes, example = examine_captures(scenario, policy, shield, pursuer, result, evaluation_key)
+                figures["capture_causes"] = causes
+                if example is not None:
+                    save_trajectory(folder / "capture.npz", example)
+            return figures
 
         def play(policy: Any, shield: str = shield) -> Trajectory:
             return rollout(scene, policy, shield, pursuer, seed)
@@ -179,8 +187,8 @@ def reproduce(
                 untrained=_measured(
                     folder / "evaluation_untrained.json", lambda: measure(GOAL_SEEKING, "goal-seeking policy")
                 ),
-                scene_trained=_recorded(folder / "scene_trained.npz", lambda p=policy: play(p)),
-                scene_untrained=_recorded(folder / "scene_untrained.npz", lambda: play(GOAL_SEEKING)),
+                scene_trained=_recorded(folder / "test_scene.npz", lambda p=policy: play(p)),
+                scene_untrained=_recorded(folder / "test_scene_untrained.npz", lambda: play(GOAL_SEEKING)),
             )
         )
     records.write_summary(

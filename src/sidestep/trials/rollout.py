@@ -109,6 +109,11 @@ def _record(
     return count, eqx.tree_at(lambda record: record.worlds, record, worlds)
 
 
+@eqx.filter_jit
+def _reset(scenario: Scenario, key: PRNGKeyArray) -> World:
+    return scenario.reset(key)
+
+
 def rollout(
     scenario: Scenario,
     policy: str | Callable[..., Any],
@@ -135,11 +140,13 @@ def rollout(
     shield = as_shield(shield, scenario)
     pursuer = as_pursuer(pursuer)
     start_key, pursuit_key = start_and_pursuit(as_key(key))
-    world = eqx.filter_jit(scenario.reset)(start_key) if world is None else world
+    world = _reset(scenario, start_key) if world is None else world
     count, record = _record(scenario, policy, shield, pursuer, world, pursuit_key, steps)
     length = int(count)
-    worlds = jax.tree.map(lambda leaf: leaf[: length + 1], record.worlds)
-    record = jax.tree.map(lambda leaf: leaf[:length], eqx.tree_at(lambda r: r.worlds, record, None))
+    # Cut on the host: JAX would compile one slice per leaf for every new length.
+    cut = lambda leaf, end: jnp.asarray(np.asarray(leaf)[:end])  # noqa: E731
+    worlds = jax.tree.map(lambda leaf: cut(leaf, length + 1), record.worlds)
+    record = jax.tree.map(lambda leaf: cut(leaf, length), eqx.tree_at(lambda r: r.worlds, record, None))
     return eqx.tree_at(lambda r: r.worlds, record, worlds, is_leaf=lambda leaf: leaf is None)
 
 
