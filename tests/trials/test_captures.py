@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from sidestep.trials import count_causes, explain_capture
+from sidestep.world import Scenario
+
 EVADER_SPEED, PURSUER_SPEED, PURSUER_GAIN = 0.1574, 0.2, 1.2
 PAPER = Scenario()
-
-from sidestep.trials import count_causes, explain_capture
 
 
 def test_head_on_capture_is_lost_where_the_row_becomes_infeasible(chase):
