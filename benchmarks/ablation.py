@@ -84,9 +84,9 @@ def table(runs: list[dict[str, Any]]) -> str:
     return "\n".join(
         [
             f"{seeds} seeds each, {first['episodes']} episodes, `game` shield, `nash` pursuer, layers of "
-            f"{' and '.join(map(str, first['hidden']))}. Converged: the first episode that closes 20 with a mean "
-            "return of at least 940, that is at least 19 of 20 reached; *never* means not within these episodes. "
-            "Shares are of all training episodes, the first random ones included.",
+            f"{' and '.join(map(str, first['hidden']))}. Converged: the first episode that closes 20 with a "
+            "mean return of at least 940, that is at least 19 of 20 reached; *never* means not within these "
+            "episodes. Shares are of all training episodes, the first random ones included.",
             "",
             *lines,
             "",
