@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import re
-import zipfile
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -84,14 +83,16 @@ def _slots(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays by pytree path, and the manifest. **Raises** `CheckpointError` when the file is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # From memory: NumPy leaves a file that it cannot make sense of open.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             manifest = json.loads(bytes(file[_MANIFEST]))
             names = json.loads(bytes(file["names"]))
             arrays = {name: file[f"leaf{i}"] for i, name in enumerate(names)}
     except FileNotFoundError:
         raise CheckpointError(f"{path} does not exist") from None
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from None
+    except Exception as error:
+        # Damage shows as whatever the first broken byte leads NumPy, zip or JSON into.
+        raise CheckpointError(f"{path} is damaged: {error or type(error).__name__}") from None
     if _digest(arrays) != manifest.get("digest"):
         raise CheckpointError(f"{path} is damaged: its digest differs from its content's")
     return arrays, manifest
@@ -147,6 +148,8 @@ def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> 
     )
     for old in list_checkpoints(folder.parent)[:-_KEPT]:
         old.unlink(missing_ok=True)
+    for torn in folder.glob(".*.tmp"):
+        torn.unlink(missing_ok=True)  # Left by a kill in the middle of a write.
     return path
 
 
@@ -167,4 +170,4 @@ def read_checkpoint(folder: str | Path, example: Tree) -> tuple[Tree, dict[str, 
             return read_arrays(path, example)
         except CheckpointError as error:
             problem = problem or error
-    raise problem or CheckpointError(f"{folder} has no checkpoint; start the run again without --resume")
+    raise problem or CheckpointError(f"{folder} has no checkpoint any more; start another run with --out")

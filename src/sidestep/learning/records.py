@@ -102,7 +102,7 @@ def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise RunError(f"{folder} is a file, not a folder; choose another --out")
-    if folder.is_dir() and any(folder.iterdir()):
+    if folder.is_dir() and not all(_is_left_by_a_kill(entry) for entry in folder.iterdir()):
         what = "a run" if (folder / _CONFIG).exists() else "files"
         raise RunError(
             f"{folder} already holds {what}, which would be overwritten; continue a run with --resume, "
@@ -112,6 +112,13 @@ def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
         (folder / name).mkdir(parents=True, exist_ok=True)
     write_json(folder / _CONFIG, config)
     return folder
+
+
+def _is_left_by_a_kill(entry: Path) -> bool:
+    """Whether this is what `create_run` leaves when it is killed before `config.json` is in place."""
+    if entry.name in ("checkpoints", "figures"):
+        return entry.is_dir() and not any(entry.iterdir())
+    return entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp"
 
 
 def open_run(folder: str | Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 
 import sidestep
 from sidestep.learning import records
-from sidestep.learning.checkpoints import read_checkpoint, write_checkpoint
+from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.policy import LearnedPolicy, write_policy
@@ -59,7 +59,9 @@ def _capacity(options: TrainingOptions, scenario: Scenario, episodes: int) -> in
 
 
 def _name(thing: Any) -> str:
-    return thing if isinstance(thing, str) else getattr(thing, "name", type(thing).__name__)
+    if isinstance(thing, str):
+        return thing
+    return getattr(thing, "name", getattr(thing, "__name__", type(thing).__name__))
 
 
 def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
@@ -135,6 +137,9 @@ def train(
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("chunk", chunk, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
+    if seed >= 2**32:
+        # JAX would drop the upper bits, and two seeds would silently be one.
+        raise ValueError(f"seed = {seed!r}: it must be less than 2^32")
     options = make_options() if options is None else options
     guard, hunter = as_shield(shield, scenario), as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)
@@ -147,15 +152,18 @@ def train(
         "episodes": int(episodes),
         "version": sidestep.__version__,
     }
+    folder = None if out is None else Path(out)
+    if folder is not None and resume:
+        _check_same_run(folder, config)
+    elif folder is not None:
+        records.create_run(folder, config)
     state = start(scenario, guard, options, jax.random.key(seed), capacity)
     metrics: list[dict[str, Any]] = []
     earlier = 0.0
-    folder = None if out is None else Path(out)
     if folder is not None and resume:
         state, earlier = _reopen(folder, config, state)
         metrics = records.read_metrics(folder)
     elif folder is not None:
-        records.create_run(folder, config)
         write_checkpoint(folder, state, wall_seconds=0.0)
 
     curves = None if folder is None else Curves(folder, purge_step=int(state.episodes) + 1)
@@ -191,21 +199,22 @@ def train(
     except KeyboardInterrupt:
         interrupted = True
     finally:
+        figures = summary()
         if curves is not None:
             curves.close()
         if folder is not None:
             records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
             write_checkpoint(folder, state, wall_seconds=earlier + time.perf_counter() - begun)
-            records.write_summary(folder, summary())
+            records.write_summary(folder, figures)
 
     policy = LearnedPolicy(state.learner.actor, options.decision_steps)
     if folder is not None and not interrupted:
         write_policy(folder, policy)
-    return Training(policy, summary(), metrics, state, interrupted, folder, chunk_seconds)
+    return Training(policy, figures, metrics, state, interrupted, folder, chunk_seconds)
 
 
-def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tuple[TrainState, float]:
-    """The state to continue from, the run's files cut back to it."""
+def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
+    """**Raises** `RunError` naming what differs from the run that `folder` holds."""
     stored = records.open_run(folder)
     for name in ("scenario", "learner", "shield", "pursuer", "seed"):
         if records.json_safe(stored.get(name)) != records.json_safe(config[name]):
@@ -218,6 +227,13 @@ def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tup
             f"{folder} was begun for {stored['episodes']} episodes; it cannot be resumed for fewer "
             f"({config['episodes']})"
         )
+
+
+def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tuple[TrainState, float]:
+    """The state to continue from, the run's files cut back to it."""
+    if not list_checkpoints(folder) and not records.read_metrics(folder):
+        # Killed before its first checkpoint: it resumes at its start.
+        return example, 0.0
     state, manifest = read_checkpoint(folder, example)
     records.truncate_metrics(folder, int(state.episodes))
     records.write_json(folder / "config.json", config)
