@@ -180,11 +180,3 @@ def test_progress_never_goes_back_and_ends_at_all(scenario):
     run(lambda *count: seen.append(count))
     assert seen == sorted(seen)
     assert seen[-1] == (40, 40)
-
-
-def test_several_pursuers_each_move():
-    crowd = load_scenario("paper", pursuer_count=3, episode_steps=30)
-    trajectory = rollout(crowd, "goal-seeking", "none", "turn-then-drive", 2)
-    moved = np.abs(np.asarray(trajectory.worlds.pursuers[-1] - trajectory.worlds.pursuers[0]))
-    assert np.all(moved.sum(axis=-1) > 0.0)
-    assert trajectory.barriers.shape == (trajectory.length, 4)

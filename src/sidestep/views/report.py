@@ -203,16 +203,24 @@ def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> 
     written = trajectory_figure(
         scenario, scene, folder / f"test-scene-{shield}", shield=shield, title="Paths, marked in seconds"
     )
-    corrected = np.asarray(scene.intervention) > 1e-6
-    clear = float(np.min(np.asarray(scene.events.obstacle_clearance)))
+    corrected = float(np.mean(np.asarray(scene.intervention) > 1e-6)) if scene.length else 0.0
+    facts = [
+        f"The shield changed the velocity in {_percent(corrected)} of the control periods."
+        if corrected
+        else "The shield never changed the velocity."
+    ]
+    clearances = (("capture", scene.events.pursuer_clearance), ("collision", scene.events.obstacle_clearance))
+    for event, clearance in clearances:
+        least = float(np.min(np.asarray(clearance)))
+        if 0.0 < least < np.inf:
+            spare = _number(1000 * least, 1, " mm") if least < 0.05 else _number(least, 2, " m")
+            facts.append(f"Closest to {event}: {spare} to spare.")
     return {
         "shield": shield,
         "figure": _figure(written),
         "outcome": OUTCOME_WORDS[scene.outcome],
         "seconds": scene.length * float(scenario.control_period),
-        "corrected": float(np.mean(corrected)) if len(corrected) else 0.0,
-        "to_capture": float(np.min(np.asarray(scene.events.pursuer_clearance))),
-        "to_collision": clear if np.isfinite(clear) else None,
+        "facts": facts,
     }
 
 
