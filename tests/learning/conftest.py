@@ -1,6 +1,7 @@
 """One small training, the same static sizes in all tests of this folder so that it compiles only once."""
 
 import functools
+import os
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -16,6 +17,17 @@ OPTIONS = {
     "warmup_decisions": 10,
     "decision_steps": 5,
     "replay_capacity": 64,
+    # Pinned, so that another default changes no test but the one of the defaults.
+    "updates_per_decision": 1,
+    "discount": 0.99,
+    "hindsight": 0.8,
+    "mirror": 0.5,
+    "exploration_noise": 0.1,
+    "reward_scale": 0.01,
+    "correction_penalty": 0.0,
+    "replay_action": "proposed",
+    "bound_values": True,
+    "last_layer_scale": 0.01,
 }
 
 
@@ -66,6 +78,21 @@ def differences(first, second):
         for name in one
         if one[name].dtype != other[name].dtype or one[name].tobytes() != other[name].tobytes()
     ]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What this process compiles, its child processes load instead of compiling it again."""
+    from jax.experimental.compilation_cache import compilation_cache
+
+    folder = str(tmp_path_factory.mktemp("compiled"))
+    compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", folder)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    yield
+    del os.environ["JAX_COMPILATION_CACHE_DIR"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="session")
