@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from sidestep._arrays import Scalar, real
 from sidestep.learning.td3 import TD3
@@ -69,42 +70,57 @@ def make_options(**values: Any) -> TrainingOptions:
     """
     algorithm_fields = [field.name for field in dataclasses.fields(TD3)]
     loop_fields = [field.name for field in dataclasses.fields(TrainingOptions) if field.name != "algorithm"]
-    for name, value in values.items():
+    for name in values:
         if name not in algorithm_fields + loop_fields:
             near = difflib.get_close_matches(name, algorithm_fields + loop_fields, n=1)
             raise ValueError(
                 f"unknown training option '{name}'" + (f"; did you mean '{near[0]}'?" if near else "")
             )
-        _check(name, value)
-    values = {**values, "hidden": tuple(values["hidden"])} if "hidden" in values else values
+    values = {name: _checked(name, value) for name, value in values.items()}
     algorithm = TD3(**{name: value for name, value in values.items() if name in algorithm_fields})
     return TrainingOptions(
         algorithm=algorithm, **{name: value for name, value in values.items() if name in loop_fields}
     )
 
 
-def _check(name: str, value: Any) -> None:
-    def fail(allowed: str) -> None:
+def _checked(name: str, value: Any) -> Any:
+    """The value in the type its field needs."""
+
+    def fail(allowed: str) -> NoReturn:
         raise ValueError(f"training option '{name}' = {value!r}: {allowed}")
 
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if name in _FLOATS:
-        low, high = _FLOATS[name]
-        if not number or not math.isfinite(value) or not low <= value <= high:
-            fail(f"it must be a finite number from {low:g} to {high:g}")
-    elif name == "bound_values":
+        least, most = _FLOATS[name]
+        # Finite in the precision that will be used: 1e60 is infinite in float32.
+        with np.errstate(over="ignore"):
+            finite = _is_number(value) and bool(np.isfinite(np.asarray(value, dtype=real(0.0).dtype)))
+        if not finite or not least <= value <= most:
+            fail(
+                "it must be a finite number, " + (f"{least:g} or more" if most == math.inf else "from 0 to 1")
+            )
+        return float(value)
+    if name in _WHOLE:
+        if not _is_number(value) or not math.isfinite(value) or value != int(value) or value < _WHOLE[name]:
+            fail(f"it must be a whole number of at least {_WHOLE[name]}")
+        return int(value)
+    if name == "bound_values":
         if not isinstance(value, bool):
             fail("it must be true or false")
-    elif name in _WHOLE:
-        if not number or value != int(value) or value < _WHOLE[name]:
-            fail(f"it must be a whole number of at least {_WHOLE[name]}")
     elif name == "replay_action":
         if value not in _REPLAY_ACTIONS:
             fail(f"it must be one of {', '.join(map(repr, _REPLAY_ACTIONS))}")
-    elif name == "hidden" and not (
-        isinstance(value, (list, tuple)) and value and all(isinstance(n, int) and n > 0 for n in value)
-    ):
-        fail("it must be layer widths, such as (256, 256)")
+    elif name == "hidden":
+        widths = value if isinstance(value, (list, tuple)) else ()
+        if not widths or not all(
+            _is_number(n) and isinstance(n, (int, np.integer)) and n > 0 for n in widths
+        ):
+            fail("it must be layer widths, such as [256, 256]")
+        return tuple(int(n) for n in widths)
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
 def options_to_dict(options: TrainingOptions) -> dict[str, Any]:

@@ -1,0 +1,128 @@
+"""Hazard: a training told something it cannot do, or something other than what was meant."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+
+from sidestep.learning import TD3, TrainingOptions, make_options, options_to_dict
+
+SHARES = {"hindsight", "mirror", "discount", "target_rate"}
+NOT_NEGATIVE = {
+    "exploration_noise",
+    "reward_scale",
+    "correction_penalty",
+    "actor_learning_rate",
+    "critic_learning_rate",
+    "target_noise",
+    "target_noise_clip",
+    "last_layer_scale",
+}
+WHOLE = {
+    "decision_steps",
+    "batch_size",
+    "updates_per_decision",
+    "warmup_decisions",
+    "replay_capacity",
+    "policy_delay",
+}
+OTHERS = {"hidden", "replay_action", "bound_values"}
+ALL = {field.name for owner in (TD3, TrainingOptions) for field in dataclasses.fields(owner)} - {"algorithm"}
+
+BAD = [
+    *(
+        (name, value)
+        for name in sorted(SHARES | NOT_NEGATIVE)
+        for value in (-0.1, math.nan, math.inf, "0.5", None, True)
+    ),
+    *((name, 1.5) for name in sorted(SHARES)),
+    *(
+        (name, value)
+        for name in sorted(WHOLE)
+        for value in (0, -3, 2.5, math.nan, math.inf, -math.inf, "4", None, True)
+    ),
+    *(("hidden", value) for value in ((), (0,), (16, -1), (16.0,), (True,), 16, "16", None, ((16,),))),
+    *(("replay_action", value) for value in ("both", "", None, 1, ["proposed"])),
+    *(("bound_values", value) for value in (1, 0, "true", None)),
+]
+
+
+def test_every_option_is_tested_here():
+    assert SHARES | NOT_NEGATIVE | WHOLE | OTHERS == ALL
+
+
+@pytest.mark.parametrize("name, value", BAD)
+def test_bad_value_is_refused_with_its_name_and_itself(name, value):
+    with pytest.raises(ValueError, match=f"'{name}' = ") as error:
+        make_options(**{name: value})
+    assert repr(value) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "wrong, meant", [("discout", "discount"), ("batchsize", "batch_size"), ("algorithm", None)]
+)
+def test_unknown_option_is_refused_with_a_guess_at_what_was_meant(wrong, meant):
+    with pytest.raises(ValueError, match=f"unknown training option '{wrong}'") as error:
+        make_options(**{wrong: 1})
+    assert meant is None or f"did you mean '{meant}'" in str(error.value)
+
+
+CHANGED = {
+    **dict.fromkeys(sorted(SHARES), 0.25),
+    **dict.fromkeys(sorted(NOT_NEGATIVE), 0.75),
+    **dict.fromkeys(sorted(WHOLE), 7),
+    "hidden": (8, 9, 10),
+    "replay_action": "executed",
+    "bound_values": False,
+}
+
+
+@pytest.mark.parametrize("name", sorted(ALL))
+def test_each_option_arrives_alone_and_comes_back_from_json(precision, name):
+    options, plain = make_options(**{name: CHANGED[name]}), make_options()
+    stored = json.loads(json.dumps(options_to_dict(options)))
+    assert set(stored) == ALL
+    given = options_to_dict(plain) | {name: CHANGED[name]}
+    assert given != options_to_dict(plain)
+    assert options_to_dict(options) == given
+    again = make_options(**stored)
+    assert options_to_dict(again) == given
+    assert jax.tree.structure(again) == jax.tree.structure(options)
+    for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(options), strict=True):
+        assert ours.dtype == theirs.dtype == (np.float64 if precision else np.float32)
+        assert ours == theirs
+
+
+def test_ends_of_ranges_are_allowed():
+    for name in SHARES | NOT_NEGATIVE:
+        make_options(**{name: 0.0})
+        make_options(**{name: 0})
+    for name in SHARES:
+        make_options(**{name: 1})
+    for name in WHOLE:
+        make_options(**{name: 1})
+
+
+@pytest.mark.parametrize("name", sorted(WHOLE))
+def test_whole_number_written_as_a_float_still_counts(name):
+    """JSON from elsewhere writes 10 as 10.0; as a float it would fail in the middle of the first compile."""
+    options = make_options(**{name: 10.0})
+    value = options_to_dict(options)[name]
+    assert value == 10
+    assert isinstance(value, int)
+
+
+def test_numbers_from_numpy_are_numbers():
+    options = make_options(discount=np.float32(0.5), batch_size=np.int64(32), hidden=(np.int64(8), 8))
+    assert options_to_dict(options)["discount"] == 0.5
+    assert options.batch_size == 32
+    assert json.loads(json.dumps(options_to_dict(options)))["hidden"] == [8, 8]
+
+
+def test_value_too_large_for_the_precision_is_refused():
+    """It would be infinite in float32, and every weight NaN after the first update."""
+    with pytest.raises(ValueError, match="'reward_scale' = 1e\\+60"):
+        make_options(reward_scale=1e60)
