@@ -43,16 +43,17 @@ def capture_figure(scenario: Scenario, trajectory: Trajectory, path: str | Path)
     """
     capture = explain_capture(scenario, trajectory)
     with house_style():
-        figure = new_figure(WIDTH, 5.3)
-        grid = figure.add_gridspec(2, 2, height_ratios=[1.45, 1.0])
-        scene, plane, speeds = (
+        figure = new_figure(WIDTH, 5.8)
+        grid = figure.add_gridspec(3, 2, height_ratios=[1.45, 1.0, 0.26])
+        scene, plane, speeds, key = (
             figure.add_subplot(grid[0, 0]),
             figure.add_subplot(grid[0, 1]),
             figure.add_subplot(grid[1, :]),
+            figure.add_subplot(grid[2, :]),
         )
         _draw_last_seconds(scene, scenario, trajectory, capture)
         _draw_velocity_plane(plane, scenario, trajectory, capture)
-        _draw_speeds(speeds, scenario, trajectory, capture)
+        _draw_speeds(speeds, key, scenario, trajectory, capture)
         when = (trajectory.length - 1) * float(scenario.control_period)
         panel_titles(
             [scene, plane, speeds],
@@ -160,15 +161,18 @@ def _draw_velocity_plane(axes: Axes, scenario: Scenario, trajectory: Trajectory,
             "nominal", tuple(nominal), xytext=(3, 5), textcoords="offset points", fontsize=7, color="#777777"
         )
     _arrow(axes, np.zeros(2), action, INK, 1.8)
+    norm = np.hypot(*action)
+    beside = np.array([action[1], -action[0]]) / norm if norm > 0 else np.array([0.0, -1.0])
     axes.annotate(
-        "executed", tuple(0.5 * action), xytext=(0, -9), textcoords="offset points", fontsize=7, ha="center"
-    )
+        "executed", tuple(0.5 * action), xytext=tuple(9 * beside), textcoords="offset points", fontsize=7,
+        va="center", ha="center" if abs(beside[1]) > 0.7 else "left" if beside[0] > 0 else "right",
+    )  # fmt: skip
     axes.plot(0.0, 0.0, "o", color=INK, markersize=3)
     axes.set_xlabel("speed away from the pursuer n·u, m/s")
     axes.set_ylabel("speed across, m/s")
 
 
-def _draw_speeds(axes: Axes, scenario: Scenario, trajectory: Trajectory, capture: Capture) -> None:
+def _draw_speeds(axes: Axes, key: Axes, scenario: Scenario, trajectory: Trajectory, capture: Capture) -> None:
     first, length = _first_shown(scenario, trajectory), float(scenario.control_period)
     times = np.arange(first, trajectory.length) * length
     limit = float(scenario.evader_speed)
@@ -199,4 +203,6 @@ def _draw_speeds(axes: Axes, scenario: Scenario, trajectory: Trajectory, capture
     axes.set_xlim(times[0], trajectory.length * length)
     axes.set_xlabel("time, s; the capture is at the right edge")
     axes.set_ylabel("along n, m/s")
-    axes.legend(loc="best", frameon=True, framealpha=0.85, edgecolor="none")
+    handles, _ = axes.get_legend_handles_labels()
+    key.set_axis_off()
+    key.legend(handles=handles, loc="center left", borderaxespad=0.0, labelspacing=0.3)

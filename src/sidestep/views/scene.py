@@ -65,10 +65,17 @@ def world_at(trajectory: Trajectory, period: int) -> World:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[period]), trajectory.worlds)
 
 
-def closest_period(trajectory: Trajectory) -> int:
-    """The control period at whose beginning a pursuer was closest to the evader."""
-    gaps = np.asarray(trajectory.worlds.pursuers)[:, :, :2] - np.asarray(trajectory.worlds.evader)[:, None]
-    return int(np.argmin(np.min(np.hypot(gaps[..., 0], gaps[..., 1]), axis=1)))
+def tightest_period(trajectory: Trajectory) -> int:
+    """The control period at whose beginning the evader was nearest to pursuers and obstacles together.
+
+    That is where the least barriers towards either sum up to least; the end, if the evader was lost there.
+    """
+    if trajectory.outcome in ("captured", "collided"):
+        return trajectory.length
+    values = np.nan_to_num(np.asarray(trajectory.barriers), neginf=0.0)
+    pursuers = trajectory.worlds.pursuers.shape[1]
+    groups = [group for group in (values[:, :pursuers], values[:, pursuers:]) if group.shape[1]]
+    return int(np.argmin(np.sum([group.min(axis=1) for group in groups], axis=0)))
 
 
 def _at(point: Float[np.ndarray, "..."]) -> tuple[float, float]:
@@ -121,34 +128,26 @@ def draw_capture_set(axes: Axes, scenario: Scenario, pose: Float[np.ndarray, "3"
     axes.plot(*outline.T, color=PURSUER, linewidth=0.8, linestyle=(0, (3, 2)), zorder=2)
 
 
-def draw_obstacles(axes: Axes, scenario: Scenario, trajectory: Trajectory, period: int) -> None:
-    """The collision circle of each obstacle at one moment, where it started, and its path."""
-    radius = float(scenario.collision_distance)
+def draw_obstacles(
+    axes: Axes, scenario: Scenario, trajectory: Trajectory, period: int, marks: Sequence[int]
+) -> None:
+    """Each obstacle's path and its collision circle at control period `period`, faintly at the time marks."""
+    radius, length = float(scenario.collision_distance), float(scenario.control_period)
     path = np.asarray(trajectory.worlds.obstacles)
     for index in range(path.shape[1]):
         axes.plot(*path[:, index, :2].T, color=OBSTACLE, linewidth=1.0, zorder=2)
-        axes.add_patch(
-            Circle(
-                _at(path[0, index, :2]),
-                radius,
-                fill=False,
-                edgecolor=FAINT,
-                linewidth=0.8,
-                linestyle=":",
-                zorder=1,
-            )
-        )
-        axes.add_patch(
-            Circle(
-                _at(path[period, index, :2]), radius, facecolor=OBSTACLE, alpha=0.18, linewidth=0, zorder=1
-            )
-        )
-        axes.add_patch(
-            Circle(
-                _at(path[period, index, :2]), radius, fill=False, edgecolor=OBSTACLE, linewidth=0.8, zorder=2
-            )
-        )
-        axes.plot(*path[period, index, :2], "o", color=OBSTACLE, markersize=3, zorder=3)
+        for mark in (0, *marks):
+            axes.add_patch(
+                Circle(
+                    _at(path[mark, index]), radius, fill=False, edgecolor=FAINT, linewidth=0.7, linestyle=":",
+                    zorder=1,
+                )
+            )  # fmt: skip
+        draw_time_marks(axes, path[:, index, :2], marks, length, OBSTACLE)
+        centre = _at(path[period, index])
+        axes.add_patch(Circle(centre, radius, facecolor=OBSTACLE, alpha=0.18, linewidth=0, zorder=1))
+        axes.add_patch(Circle(centre, radius, fill=False, edgecolor=OBSTACLE, linewidth=0.8, zorder=2))
+        axes.plot(*centre, "o", color=OBSTACLE, markersize=4, zorder=8.5)
 
 
 def draw_target(axes: Axes, scenario: Scenario, target: Float[np.ndarray, "2"]) -> None:

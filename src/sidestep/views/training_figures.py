@@ -52,6 +52,7 @@ def reward_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         _finish_returns(top, rows)
         _draw_outcomes(raster, rows)
         panel_titles([top, raster], ["Accumulated reward per training episode", "How each episode ended"])
+        top.set_title(top.get_title("left"), pad=20.0)
         return save(figure, path)
 
 
@@ -112,11 +113,12 @@ def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
     handles, _ = axes.get_legend_handles_labels()
     diamond = Line2D(
         [], [], marker="D", linestyle="none", color=INK, markersize=4.5,
-        label=f"converged (mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f})",
+        label=f"converged: mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f}",
     )  # fmt: skip
+    # Above the axes, where no curve can run.
     axes.legend(
-        handles=[*handles, diamond], loc="lower right", ncols=1 if len(handles) < 4 else 2, frameon=True,
-        framealpha=0.85, edgecolor="none",
+        handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, borderaxespad=0.2,
+        columnspacing=1.4, handletextpad=0.5,
     )  # fmt: skip
 
 

@@ -15,7 +15,6 @@ from matplotlib.patches import Patch
 from sidestep.safety import Status
 from sidestep.trials import Trajectory
 from sidestep.views.scene import (
-    closest_period,
     correction_colours,
     draw_barrier_levels,
     draw_capture_set,
@@ -26,6 +25,7 @@ from sidestep.views.scene import (
     draw_time_marks,
     mark_periods,
     set_limits,
+    tightest_period,
     world_at,
 )
 from sidestep.views.style import (
@@ -62,12 +62,12 @@ def trajectory_figure(
     """The paths of evader, pursuers and obstacles, and below them barriers and corrections over time.
 
     **Arguments:** `shield` the name of the shield used, for words and for which barrier's level sets are
-    drawn; `moment` the time (s) at which pursuers' capture sets, obstacles and level sets are drawn: that of
-    the closest approach if not given.
+    drawn; `moment` the time (s) at which pursuers' capture sets, obstacles and level sets are drawn: when it
+    was tightest between pursuers and obstacles if not given.
 
     Writes PNG and PDF; returns their paths.
     """
-    period = closest_period(trajectory)
+    period = tightest_period(trajectory)
     if moment is not None:
         period = int(np.clip(round(moment / float(scenario.control_period)), 0, trajectory.length))
     with house_style():
@@ -169,18 +169,18 @@ def draw_scene(
     limits: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Everything that moved, with time marks; capture and level sets at control period `period`."""
-    period = closest_period(trajectory) if period is None else period
+    period = tightest_period(trajectory) if period is None else period
     world = world_at(trajectory, period)
     set_limits(axes, np.stack(limits if limits is not None else _extent(trajectory)), _margin(scenario))
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     draw_barrier_levels(axes, scenario, world, pursuit=shield in _PURSUIT_SHIELDS)
-    draw_obstacles(axes, scenario, trajectory, period)
+    length = float(scenario.control_period)
+    marks = mark_periods(trajectory.length * length, length)
+    draw_obstacles(axes, scenario, trajectory, period, marks)
     draw_target(axes, scenario, np.asarray(trajectory.worlds.target[0]))
     draw_evader_path(axes, trajectory, norm)
 
-    length = float(scenario.control_period)
-    marks = mark_periods(trajectory.length * length, length)
     paths = np.asarray(trajectory.worlds.pursuers)
     for index in range(paths.shape[1]):
         draw_capture_set(axes, scenario, paths[period, index])
