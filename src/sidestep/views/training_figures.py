@@ -49,10 +49,9 @@ def reward_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = shield_colour(shield, position), shield_words(shield)
             _draw_returns(top, group, colour, words, line=len(groups) == 1)
+        panel_titles([top, raster], ["Accumulated reward per training episode", "How each episode ended"])
         _finish_returns(top, rows)
         _draw_outcomes(raster, rows)
-        panel_titles([top, raster], ["Accumulated reward per training episode", "How each episode ended"])
-        top.set_title(top.get_title("left"), pad=20.0)
         return save(figure, path)
 
 
@@ -116,8 +115,13 @@ def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
         label=f"converged: mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f}",
     )  # fmt: skip
     # Above the axes, where no curve can run.
+    columns = (
+        4 if len(handles) <= 3 and not any("seeds" in str(handle.get_label()) for handle in handles) else 3
+    )
+    rows = -(-(len(handles) + 1) // columns)
+    axes.set_title(axes.get_title("left"), pad=6.0 + 14.0 * rows)
     axes.legend(
-        handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, borderaxespad=0.2,
+        handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2,
         columnspacing=1.4, handletextpad=0.5,
     )  # fmt: skip
 
