@@ -115,14 +115,12 @@ def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
         label=f"converged: mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f}",
     )  # fmt: skip
     # Above the axes, where no curve can run.
-    columns = (
-        4 if len(handles) <= 3 and not any("seeds" in str(handle.get_label()) for handle in handles) else 3
-    )
-    rows = -(-(len(handles) + 1) // columns)
+    in_one_row = len(handles) <= 3 and len(runs) == len(handles)
+    columns, rows = (4, 1) if in_one_row else (3, len(handles) // 3 + 1)
     axes.set_title(axes.get_title("left"), pad=6.0 + 14.0 * rows)
     axes.legend(
-        handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2,
-        columnspacing=1.4, handletextpad=0.5,
+        handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+        borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5,
     )  # fmt: skip
 
 
