@@ -1,12 +1,18 @@
 """The command line: what it writes, what it refuses, and that a refusal touches nothing."""
 
 import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
 from sidestep.cli import main, parse_overrides
 
-SMALL = ["--episodes", "2", "--set", "episode_steps=60", "--learner", "hidden=[8, 8]", "batch_size=8"]
+LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
+SMALL = ["--episodes", "2", "--set", "episode_steps=60", "--learner", *LEARNER]
 
 SUMMARY_KEYS = [
     "episodes",
@@ -32,7 +38,7 @@ SUMMARY_KEYS = [
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, compiled_programs):
     folder = tmp_path_factory.mktemp("runs")
     out = folder / "run"
     assert main(["train", "--out", str(out), "--json", str(folder / "s.json"), "--seed", "5", *SMALL]) == 0
@@ -69,6 +75,49 @@ def test_evaluation_reports_counts_with_their_bounds(run, tmp_path):
     assert figures["shield"] == "game"
 
 
+def test_resumed_run_is_the_longer_run(run, tmp_path):
+    out, _ = run
+    shutil.copytree(out, tmp_path / "run")
+    assert main(["train", "--out", str(tmp_path / "run"), "--resume", "--episodes", "3"]) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["episodes"], summary["seed"]) == (3, 5)
+    longer, shorter = (folder / "metrics.jsonl" for folder in (tmp_path / "run", out))
+    assert longer.read_bytes().startswith(shorter.read_bytes())
+    assert len(longer.read_text().splitlines()) == 3
+
+
+CHILD = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # A background shell has its children ignore it.
+from sidestep.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_interrupt_stops_cleanly_and_the_run_goes_on_from_there(run, tmp_path):
+    out = tmp_path / "run"
+    arguments = ["train", "--out", str(out), "--seed", "5", *SMALL, "--episodes", "1500"]
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as child:
+        while child.poll() is None and not (out / "metrics.jsonl").exists():
+            time.sleep(0.005)
+        child.send_signal(signal.SIGINT)
+        shown = child.communicate()[0]
+    assert child.returncode == 130, shown
+    assert "Traceback" not in shown
+    assert "--resume" in shown
+    done = len((out / "metrics.jsonl").read_text().splitlines())
+    assert 0 < done < 1500
+    assert json.loads((out / "summary.json").read_text())["episodes"] == done
+    assert main(["evaluate", str(out), "--episodes", "1"]) == 2
+    assert main(["train", "--out", str(out), "--resume", "--episodes", "1500"]) == 0
+    lines = (out / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["episode"] for line in lines] == list(range(1, 1501))
+    # The first episodes are those of the run that was asked for two only.
+    assert lines[:2] == (run[0] / "metrics.jsonl").read_text().splitlines()
+
+
 def test_report_of_a_run_needs_no_network(run):
     out, _ = run
     assert main(["report", str(out)]) == 0
@@ -86,6 +135,10 @@ def test_report_of_a_run_needs_no_network(run):
         (["train", "--out", "{out}", "--set", "evader_speed"], "NAME=VALUE"),
         (["train", "--out", "{out}", "--set", "evader_speed=-1"], "greater than 0"),
         (["train", "--out", "{out}", "--learner", "discount=2"], "discount"),
+        (["train", "--out", "{out}", "--learner", "batch_size=NaN"], "batch_size"),
+        (["train", "--out", "{out}", "--learner", "decision_steps=Infinity"], "decision_steps"),
+        (["train", "--out", "{out}", "--seed", "-1"], "seed"),
+        (["train", "--out", "{out}", "--seed", "99999999999999999999"], "seed"),
         (["train", "--out", "{out}", "--episodes", "0"], "episodes"),
         (["train", "--out", "{out}", "--resume"], "no run"),
         (["evaluate", "{out}"], "no run"),

@@ -1,7 +1,6 @@
 """One small training, the same static sizes in all tests of this folder so that it compiles only once."""
 
 import functools
-import os
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -81,18 +80,8 @@ def differences(first, second):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What this process compiles, its child processes load instead of compiling it again."""
-    from jax.experimental.compilation_cache import compilation_cache
-
-    folder = str(tmp_path_factory.mktemp("compiled"))
-    compilation_cache.reset_cache()
-    jax.config.update("jax_compilation_cache_dir", folder)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-    yield
-    del os.environ["JAX_COMPILATION_CACHE_DIR"]
-    jax.config.update("jax_compilation_cache_dir", None)
-    compilation_cache.reset_cache()
+def _share_with_child_processes(compiled_programs: None) -> None:
+    """Everything here compiles into the cache that child processes read."""
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,254 @@
+"""Hazard: a training loop that is not the one asked for: another end, seed, action, precision, program."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep._arrays import real
+from sidestep.learning.records import CONVERGENCE_WINDOW
+from sidestep.learning.replay import on_disc, sample
+from sidestep.learning.td3 import update
+from sidestep.learning.training import _learn, run_chunk, start
+from sidestep.pursuit import as_pursuer
+from sidestep.safety import as_shield
+from sidestep.world import observe, to_action
+
+
+def test_training_stops_exactly_at_its_last_episode_whatever_the_chunk(small, small_run):
+    other = small.train(chunk=7)
+    assert len(small_run.metrics) == 8
+    assert small_run.metrics == other.metrics
+    assert small.differences(small_run.state, other.state) == []
+    decisions = int(small_run.state.decisions)
+    assert decisions % 10
+    assert decisions % 7, "the last chunks have to overshoot for this to test anything"
+    assert int(small_run.state.replay.written) == decisions
+    assert int(small_run.state.env_steps) == sum(line["steps"] for line in small_run.metrics)
+
+
+def test_one_update_per_decision_after_the_warm_up_and_none_within(small, small_run):
+    assert int(small_run.state.learner.updates) == int(small_run.state.decisions) - 10
+    scenario, options = small.scenario(), small.options()
+    shield, pursuer = as_shield("game", scenario), as_pursuer("turn-then-drive")
+    state = start(scenario, shield, options, jax.random.key(0), 64)
+    warm, _ = run_chunk(scenario, shield, pursuer, options, state, jnp.asarray(8), 10)
+    assert int(warm.decisions) == 10
+    assert small.differences(warm.learner, state.learner) == []
+
+
+def test_seed_decides_everything(small, small_run):
+    again, other = small.train(), small.train(seed=1)
+    assert again.metrics == small_run.metrics
+    assert small.differences(again.state, small_run.state) == []
+    changed = small.differences(other.state, small_run.state)
+    for part in (".learner.actor", ".replay.transitions.world.evader", ".world.target", ".key"):
+        assert any(name.startswith(part) for name in changed), part
+
+
+def test_other_numbers_do_not_compile_anything_again(small, small_run):
+    """Speeds, gains, rates, noises, seeds: all traced. A recompilation takes longer than many episodes."""
+    compiled = []
+
+    def listen(event, duration, **_):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(event)
+
+    scenario = small.scenario(
+        evader_speed=0.31, pursuer_speed=0.25, pursuer_gain=2.0, obstacle_gain=0.7, capture_distance=0.19
+    )
+    numbers = {
+        "actor_learning_rate": 1e-4,
+        "discount": 0.95,
+        "hindsight": 0.3,
+        "mirror": 0.1,
+        "reward_scale": 0.02,
+    }
+    options = small.options(**numbers, exploration_noise=0.3, correction_penalty=0.5, target_noise=0.1)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        training = small.train(scenario, options, seed=5)
+        assert compiled == []
+        # Shows that the listener hears.
+        jax.jit(lambda x: x * 3.25)(real(1.0))
+        assert compiled != []
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert small.differences(training.state, small_run.state) != []
+
+
+def test_chunk_returns_exactly_the_types_it_takes(small):
+    """Or else the second chunk of every training compiles anew: a weakly typed count is enough."""
+    scenario, options = small.scenario(), small.options()
+    shield, pursuer = as_shield("game", scenario), as_pursuer("turn-then-drive")
+    state = start(scenario, shield, options, jax.random.key(0), 64)
+    after, _ = eqx.filter_eval_shape(run_chunk, scenario, shield, pursuer, options, state, jnp.asarray(8), 10)
+    given, returned = jax.tree.leaves(state), jax.tree.leaves(after)
+    for before, now in zip(given, returned, strict=True):
+        assert (before.shape, before.dtype) == (now.shape, now.dtype)
+        assert getattr(before, "weak_type", False) == getattr(now, "weak_type", False)
+
+
+def test_seeds_and_learning_rates_under_vmap_train_as_they_do_alone(small, x64):
+    """In float64, where rounding (the one difference there may be) stays far below the tolerance of 1e-8."""
+    scenario, options = small.scenario(), small.options()
+    shield, pursuer = as_shield("game", scenario), as_pursuer("turn-then-drive")
+    limit = jnp.asarray(3)
+
+    def chunk(rate, state):
+        changed = eqx.tree_at(lambda o: o.algorithm.actor_learning_rate, options, rate)
+        return run_chunk(scenario, shield, pursuer, changed, state, limit, 10)
+
+    states = [start(scenario, shield, options, jax.random.key(seed), 64) for seed in (0, 1)]
+    rates = [real(3e-4), real(1e-2)]
+    alone = []
+    for rate, state in zip(rates, states, strict=True):
+        for _ in range(3):
+            state, report = chunk(rate, state)
+        alone.append((state, report))
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    batched = eqx.filter_jit(eqx.filter_vmap(chunk))
+    for _ in range(3):
+        together, report = batched(jnp.stack(rates), together)
+    expected = small.leaves_of(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone))
+    actual = small.leaves_of((together, report))
+    assert int(together.learner.updates.sum()) > 20
+    for name, leaf in expected.items():
+        np.testing.assert_allclose(actual[name], leaf, rtol=1e-8, atol=1e-8, err_msg=name)
+        # What double precision trains in is double precision throughout.
+        assert leaf.dtype != np.float32, name
+        assert np.all(np.isfinite(leaf)) or name.startswith("[0].tally"), name
+
+
+# Which action is learned from ------------------------------------------------------------------------------
+
+
+class Elsewhere(eqx.Module):
+    """A shield that always answers with the same velocity."""
+
+    velocity: jax.Array
+
+    def init(self, world):
+        return ()
+
+    def __call__(self, world, nominal, memory):
+        from sidestep.safety.shields import ShieldResult
+
+        result = ShieldResult(
+            action=self.velocity,
+            status=jnp.asarray(1, jnp.int32),
+            barriers=jnp.zeros(2),
+            slack=real(0.0),
+            intervention=real(0.0),
+        )
+        return result, memory
+
+
+def test_executed_actions_are_learned_from_with_the_target_action_through_the_shield(small, small_run):
+    scenario = small.scenario()
+    shield = Elsewhere(real([0.05, -0.1]))
+    replay = small_run.state.replay
+    # Steep target critics and no bonus, so that the target action makes a difference.
+    learner = eqx.tree_at(
+        lambda x: x.target_critic,
+        small_run.state.learner,
+        jax.tree.map(lambda w: 5.0 * w, small_run.state.learner.critic),
+    )
+    options, key = small.options(replay_action="executed", hindsight=0.0), jax.random.key(11)
+
+    @jax.jit
+    def by_hand(learner):
+        sample_key, update_key = jax.random.split(jax.random.split(key, 1)[0])
+        settings = {
+            "hindsight": options.hindsight,
+            "mirror": options.mirror,
+            "executed_action": True,
+            "correction_penalty": options.correction_penalty,
+            "reward_scale": options.reward_scale,
+        }
+        batch, after = sample(scenario, replay, sample_key, 16, **settings)
+        shielded = jax.vmap(lambda world: to_action(scenario, world, shield.velocity))(after)
+        return [
+            update(options.algorithm, learner, batch, update_key, on_disc, target, real(10.0))
+            for target in (lambda actions, key: shielded, on_disc)
+        ]
+
+    expected, unshielded = by_hand(learner)
+    actual = jax.jit(lambda learner: _learn(scenario, shield, options, learner, replay, key))(learner)
+    leaves = small.leaves_of(actual)
+    for name, leaf in small.leaves_of(expected).items():
+        np.testing.assert_allclose(leaf, leaves[name], rtol=1e-4, atol=1e-5, err_msg=name)
+    assert abs(float(unshielded[1].critic / expected[1].critic) - 1.0) > 2e-3
+
+
+def test_each_choice_of_replay_action_trains_and_gives_another_policy(small):
+    # A pursuer fast enough that the shield has to correct much.
+    scenario = small.scenario(pursuer_speed=1.0)
+    runs = {
+        "proposed": small.train(scenario),
+        "penalty": small.train(scenario, small.options(correction_penalty=50.0)),
+        "executed": small.train(scenario, small.options(replay_action="executed")),
+    }
+    assert sum(line["interventions"] for line in runs["proposed"].metrics) > 20
+    critics = []
+    for training in runs.values():
+        assert len(training.metrics) == 8
+        leaves = small.leaves_of(training.state.learner)
+        assert all(np.all(np.isfinite(leaf)) for leaf in leaves.values())
+        critics.append(leaves[".critic.first.weights[0]"])
+    for i in range(3):
+        assert not np.allclose(critics[i], critics[i - 1], atol=1e-6)
+
+
+# Does it learn? --------------------------------------------------------------------------------------------
+
+TOY = {
+    "obstacle_count": 0,
+    "evader_start": (0.0, 0.0),
+    "pursuer_starts": ((50.0, 50.0, 0.0),),
+    "evader_speed": 1.0,
+    "target_separation": 0.7,
+    "reach_distance": 0.1,
+}
+QUICK = {"actor_learning_rate": 3e-3, "critic_learning_rate": 3e-3, "replay_capacity": 512}
+
+
+def toy_train(small, scenario, episodes, **options):
+    chosen = small.options(**{**QUICK, **options})
+    return small.train(scenario, chosen, shield="none", pursuer="still", episodes=episodes)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_training_learns_to_reach_and_not_training_does_not(small, seed):
+    scenario = small.scenario(**TOY)
+    reached = {}
+    for rate in (3e-3, 0.0):
+        settings = small.options(
+            **{**QUICK, "actor_learning_rate": rate, "critic_learning_rate": rate},
+            discount=0.9,
+            target_rate=0.02,
+        )
+        training = small.train(scenario, settings, shield="none", pursuer="still", episodes=64, seed=seed)
+        last = training.metrics[-CONVERGENCE_WINDOW:]
+        reached[rate] = sum(line["outcome"] == "reached" for line in last) / len(last)
+    assert reached[3e-3] >= 0.9
+    assert reached[0.0] <= 0.3
+
+
+def test_time_limits_are_bootstrapped_through_all_the_way(small):
+    """An evader that cannot move pays the same for ever; that its episodes are cut must not show."""
+    scenario = small.scenario(**{**TOY, "evader_speed": 1e-6})
+    training = toy_train(
+        small, scenario, 150, discount=0.8, target_rate=0.1, hindsight=0.0, reward_scale=20.0
+    )
+    assert all(line["outcome"] == "timed_out" for line in training.metrics)
+    ratios = []
+    for seed in range(8):
+        world = scenario.reset(jax.random.key(seed))
+        per_decision = -20.0 * 0.01 * 5 * float(jnp.linalg.norm(world.target - world.evader))
+        values = training.state.learner.critic(observe(scenario, world)[None], jnp.zeros((1, 2)))
+        ratios += [float(value[0]) / (per_decision / (1.0 - 0.8)) for value in values]
+    # Were the cuts taken for ends, eight decisions to an episode, the values would be 0.58 of this.
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
+    assert min(ratios) > 0.8
