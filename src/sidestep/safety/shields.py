@@ -5,7 +5,7 @@ from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep._arrays import AnyArray, Scalar
 from sidestep.safety.barriers import (
@@ -63,13 +63,28 @@ class Shield(eqx.Module):
         """
 
 
+def _known(world: World) -> Bool[Array, "n"]:
+    """Per pursuer and obstacle: whether it and the evader are where numbers say.
+
+    Asked of the world itself, because a NaN can vanish on its way into a row: every comparison with it is
+    false, and a `where` then takes the other case.
+    """
+    robots = [jnp.all(jnp.isfinite(group), axis=-1) for group in (world.pursuers, world.obstacles)]
+    return jnp.concatenate(robots) & jnp.all(jnp.isfinite(world.evader))
+
+
 def _decide(
-    scenario: Scenario, nominal: Float[AnyArray, "2"], rows: BarrierRows, *, enforced: bool, hard: int
+    scenario: Scenario,
+    world: World,
+    nominal: Float[AnyArray, "2"],
+    rows: BarrierRows,
+    *,
+    enforced: bool,
+    hard: int,
 ) -> ShieldResult:
     nominal = jnp.asarray(nominal, rows.values.dtype)
-    known = (
-        jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets) & jnp.all(jnp.isfinite(rows.normals), axis=-1)
-    )
+    known = _known(world) & jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
+    known &= jnp.all(jnp.isfinite(rows.normals), axis=-1)
     wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
     # With part of the world unknown nothing vouches for the nominal action.
     vouched = jnp.where(jnp.all(known), nominal, 0.0)
@@ -77,7 +92,7 @@ def _decide(
     projection = project(
         vouched,
         rows.normals[:count],
-        rows.offsets[:count],
+        jnp.where(known, rows.offsets, jnp.nan)[:count],
         scenario.evader_speed,
         hard=hard if enforced else 0,
         circle=scenario.action == "heading",
@@ -116,7 +131,7 @@ class NoShield(Shield):
 
     def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
         rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
-        return _decide(self.scenario, nominal, rows, enforced=False, hard=0), memory
+        return _decide(self.scenario, world, nominal, rows, enforced=False, hard=0), memory
 
 
 @final
@@ -134,7 +149,8 @@ class PaperShield(Shield):
 
     def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
         rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
-        return _decide(self.scenario, nominal, rows, enforced=True, hard=self.scenario.pursuer_count), memory
+        hard = self.scenario.pursuer_count
+        return _decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
 
 
 @final
@@ -154,7 +170,8 @@ class GameShield(Shield):
     def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
         memory = PursuitBarrier().remember(self.scenario, world, memory)
         rows = _with_obstacles(PursuitBarrier(), self.scenario, world, memory)
-        return _decide(self.scenario, nominal, rows, enforced=True, hard=self.scenario.pursuer_count), memory
+        hard = self.scenario.pursuer_count
+        return _decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
 
 
 SHIELDS: dict[str, type[Shield]] = {"none": NoShield, "paper": PaperShield, "game": GameShield}
