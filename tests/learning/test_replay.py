@@ -313,8 +313,9 @@ def driven(small):
     options = small.options(exploration_noise=1.0)
     shield, pursuer = as_shield("game", scenario), as_pursuer("turn-then-drive")
     state = start(scenario, shield, options, jax.random.key(3), 64)
-    transitions, reports = [], []
-    for _ in range(30):
+    transitions, reports, seen = [], [], set()
+    # Rounding differs between processors, so how long it takes until everything has happened does too.
+    while len(reports) < 30 or (len(seen) < len(OUTCOMES) and len(reports) < 200):
         before = int(state.replay.written)
         state, report = run_chunk(scenario, shield, pursuer, options, state, jnp.asarray(10_000), 10)
         slots = np.arange(before, int(state.replay.written)) % 64
@@ -322,6 +323,7 @@ def driven(small):
             jax.tree.map(lambda ring, slots=slots: np.asarray(ring)[slots], state.replay.transitions)
         )
         reports.append(jax.tree.map(np.asarray, report))
+        seen |= set(reports[-1].outcome[reports[-1].ended].tolist())
 
     def join(parts):
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

@@ -120,9 +120,20 @@ def test_single_precision_tells_the_same_story_as_double(problems):
                 answers.append((np.asarray(answer.action, np.float64), np.asarray(answer.status)))
         (action, status), (exact_action, exact_status) = answers
         assert np.mean(status != exact_status) <= 1e-3
-        # Square roots of rounding where a line touches the disc, or three rows nearly meet in a point.
-        assert np.max(np.abs(action - exact_action)) <= 2e-3 * batch.limit
-        assert np.quantile(np.abs(action - exact_action), 0.99) <= 1e-5 * batch.limit
+        # What is asked for first: the worst of the hard rows, given way to in the same measure.
+        normals, offsets = single.cast(np.dtype(np.float64)).unit_rows()
+        short = [
+            np.max((offsets - np.einsum("nki,ni->nk", normals, u))[:, :hard], axis=1)
+            for u in (action, exact_action)
+        ]
+        excess = np.maximum(short[0], 0.0) - np.maximum(short[1], 0.0)
+        assert np.max(excess) <= 4.0 * tolerance(np.dtype(np.float32)) * batch.limit
+        # The action itself is worse conditioned: square roots of rounding where a line touches the disc, and
+        # rounding over the sine of the angle where two lines nearly coincide (here down to 0.002).
+        distance = np.max(np.abs(action - exact_action), axis=1)
+        assert np.max(distance) <= 5e-3 * batch.limit
+        assert np.quantile(distance, 0.999) <= 1e-3 * batch.limit
+        assert np.quantile(distance, 0.99) <= 1e-4 * batch.limit
 
 
 def test_huge_and_tiny_numbers_cost_no_digits(precision):

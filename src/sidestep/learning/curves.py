@@ -17,7 +17,10 @@ class Curves:
         # Imported here because it is needed by trainings only and takes a while.
         from tensorboardX import SummaryWriter
 
-        self._writer = SummaryWriter(str(Path(folder) / "curves"), purge_step=purge_step)
+        place = Path(folder) / "curves"
+        # Files are named by the second; the count keeps a resume within it from overwriting what is there.
+        count = len(list(place.glob("events.out.tfevents.*")))
+        self._writer = SummaryWriter(str(place), purge_step=purge_step, filename_suffix=f".{count:06d}")
 
     def write(self, lines: list[dict[str, Any]], report: Report) -> None:
         """Add the episodes of a chunk, and the mean losses of the chunk at its last episode."""

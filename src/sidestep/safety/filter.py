@@ -27,6 +27,8 @@ _UNROLLED = 4
 # Distances squared are at most 5.
 _UNLIKELY = 8.0
 _REJECTED = 16.0
+# What rounding leaves to break, the hard rows share as little.
+_HARDER = 16.0
 
 
 class Projection(eqx.Module):
@@ -111,7 +113,7 @@ def project(
             tier, level = relax(part(relaxed, 0, last), first, circle)
             relaxed = Rows(*(jnp.concatenate([a, b[last:]]) for a, b in zip(tier, relaxed, strict=True)))
             given_way = jnp.maximum(given_way, level)
-    answer = _closest(wish, start, weight, relaxed, circle)
+    answer = _closest(wish, start, weight, relaxed, hard, circle)
 
     infeasible = (given_way > tolerance(dtype)) | (answer.violation > tolerance(dtype))
     # A robot that cannot move has one action: zero.
@@ -187,7 +189,7 @@ def _worst(measure: Callable[[Any, Any], Any], lines: Any, rows: Any) -> Any:
 
 
 def _closest(
-    wish: Float[Array, "2"], start: Float[Array, "2"], weight: Scalar, rows: Rows, circle: bool
+    wish: Float[Array, "2"], start: Float[Array, "2"], weight: Scalar, rows: Rows, hard: int, circle: bool
 ) -> _Answer:
     """The closest feasible point, given that there is one; if rounding hides it, the least bad candidate.
 
@@ -235,12 +237,16 @@ def _closest(
         t = jnp.clip(allowed, -half, half)
         # Some row that the start violates is active at the answer; the others only help against rounding.
         likely = short_of_start > 0.0
-    violation = jnp.maximum(_worst(miss, (x, y, c, t), rows), jnp.abs(c) - 1.0)
+    lines, outside = (x, y, c, t), jnp.abs(c) - 1.0
+    violation = jnp.maximum(_worst(miss, lines, rows), outside)
     ahead = c - x * start[0] - y * start[1]
     aside = t - (x * start[1] - y * start[0])
     distance = ahead**2 + aside**2 + weight * (1.0 - c**2 - t**2)
     key = jnp.where(likely, distance, _UNLIKELY + distance)
-    key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + violation)
+    rank = violation
+    if 0 < hard < rows.c.shape[0]:
+        rank = jnp.maximum(rank, _HARDER * jnp.maximum(_worst(miss, lines, part(rows, 0, hard)), outside))
+    key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + rank)
     chosen = jnp.arange(key.shape[0]) == jnp.argmin(key)
     pick = lambda entry: jnp.sum(jnp.where(chosen, entry, 0.0))  # noqa: E731
 
