@@ -9,7 +9,8 @@ import time
 
 import pytest
 
-from sidestep.cli import main, parse_overrides
+from sidestep.cli import main
+from sidestep.commands.common import parse_overrides
 
 LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
 SMALL = ["--episodes", "2", "--set", "episode_steps=60", "--learner", *LEARNER]

@@ -1,0 +1,98 @@
+"""What the commands share: argument types, NAME=VALUE settings, JSON output and progress bars."""
+
+from __future__ import annotations
+
+import abc
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sidestep.learning import Progress
+
+Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=VALUE ...]")]
+PursuerName = Annotated[str, tyro.conf.arg(metavar="NAME")]
+ShieldName = Annotated[str, tyro.conf.arg(metavar="NAME")]
+ScenarioName = Annotated[str, tyro.conf.arg(metavar="NAME|FILE")]
+
+
+def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
+    """`("a=1", "b=[0, 1]", "c=text")` as values: JSON where it is JSON, else text.
+
+    **Raises** `ValueError` for an argument without `=`.
+    """
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            raise ValueError(f"'{pair}' is not of the form NAME=VALUE")
+        try:
+            values[name] = json.loads(text)
+        except json.JSONDecodeError:
+            values[name] = text
+    return values
+
+
+def write_json_file(path: Path | None, data: Any) -> None:
+    """Write `data` to `path`, if there is one; folders on the way to it are made."""
+    if path is not None:
+        from sidestep.learning.records import write_json
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, data)
+
+
+class _Bar(abc.ABC):
+    """A progress bar on the error stream, so that results alone go to standard output.
+
+    A context manager that gives its `update`.
+    """
+
+    def __init__(self, console: Console, label: str):
+        from rich.console import Console as RichConsole
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=RichConsole(stderr=True),
+        )
+        self._task = self._progress.add_task(label, total=None, note="compiling")
+
+    def __enter__(self) -> Callable[..., None]:
+        self._progress.__enter__()
+        return self.update
+
+    @abc.abstractmethod
+    def update(self, *values: Any) -> None:
+        """Show where the work is."""
+
+    def __exit__(self, *error: Any) -> None:
+        self._progress.__exit__(*error)
+
+
+class TrainingBar(_Bar):
+    """Episode, steps per second, mean return of the last 20 episodes, safe count."""
+
+    def update(self, *values: Any) -> None:
+        progress: Progress = values[0]
+        note = f"{progress.steps_per_second:,.0f} steps/s  safe {progress.safe}"
+        if progress.last is not None:
+            note += f"  return {progress.last['return']:.0f} (mean of 20: {progress.mean_return:.0f})"
+        self._progress.update(self._task, total=progress.episodes, completed=progress.episode, note=note)
+
+
+class CountBar(_Bar):
+    """Finished of all."""
+
+    def update(self, *values: Any) -> None:
+        finished, total = values
+        self._progress.update(self._task, total=total, completed=finished, note="")

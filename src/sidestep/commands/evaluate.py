@@ -1,0 +1,89 @@
+"""`sidestep evaluate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from sidestep.commands.common import CountBar, Overrides, parse_overrides, write_json_file
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sidestep.trials import Evaluation
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a policy under a shield against a pursuer over random episodes, with 95 % bounds."""
+
+    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
+    """Run folder whose policy to evaluate, or goal-seeking for the untrained one."""
+    scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Preset or file; the run's own scenario, or paper, by default."""
+    shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Shield; the run's own, or game, by default."""
+    pursuer: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Pursuer strategy; the run's own, or nash, by default."""
+    episodes: int = 1000
+    """Episodes to measure."""
+    seed: int = 0
+    """Seed of starts, targets and random pursuers."""
+    batch: int = 512
+    """Episodes that run at once."""
+    set: Overrides = ()
+    """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""
+    json: Path | None = None
+    """Also write the figures to this file."""
+
+
+def run(command: Evaluate, console: Console) -> int:
+    """Run `sidestep evaluate`; returns the exit status."""
+    from sidestep.learning import load_policy
+    from sidestep.learning.records import open_run
+    from sidestep.trials import evaluate as run_evaluation
+    from sidestep.world import load_scenario
+
+    overrides = parse_overrides(command.set)
+    policy: Any = command.run
+    config: dict[str, Any] = {}
+    if command.run != "goal-seeking":
+        policy = load_policy(command.run)
+        config = open_run(command.run) if Path(command.run).is_dir() else {}
+    if command.scenario is None and config:
+        scenario = load_scenario("paper", **{**config["scenario"], **overrides})
+    else:
+        scenario = load_scenario(command.scenario or "paper", **overrides)
+    shield = command.shield or config.get("shield", "game")
+    pursuer = command.pursuer or config.get("pursuer", "nash")
+    with CountBar(console, f"episodes, {shield} shield, {pursuer} pursuer") as show:
+        evaluation = run_evaluation(
+            scenario, policy, shield, pursuer, command.episodes, command.seed, batch=command.batch,
+            progress=show,
+        )  # fmt: skip
+    console.print(evaluation_table(evaluation))
+    about = {"policy": command.run, "shield": shield, "pursuer": pursuer, "scenario": scenario.name}
+    write_json_file(command.json, {**evaluation.to_dict(), **about, "seed": command.seed})
+    return 0
+
+
+def evaluation_table(evaluation: Evaluation) -> Any:
+    """Counts and rates with their 95 % Wilson bounds."""
+    from rich.table import Table
+
+    figures = evaluation.to_dict()
+    table = Table("outcome", "episodes", "share", "95 % bounds", title=f"{evaluation.episodes} episodes")
+    for name in ("captured", "collided", "reached", "timed_out"):
+        low, high = figures[f"{name}_rate_low"], figures[f"{name}_rate_high"]
+        share = figures[f"{name}_rate"]
+        table.add_row(name.replace("_", " "), str(figures[name]), f"{share:.2%}", f"{low:.2%} to {high:.2%}")
+    median = figures["reach_time_median"]
+    table.caption = (
+        f"median time to reach {'-' if median is None else f'{median:.1f} s'}; "
+        f"shield corrects {figures['intervention_rate']:.1%} of steps, cannot satisfy all rows in "
+        f"{figures['infeasible_rate']:.2%}"
+    )
+    return table

@@ -1,0 +1,93 @@
+"""`sidestep train`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sidestep.commands.common import (
+    Overrides,
+    PursuerName,
+    ScenarioName,
+    ShieldName,
+    TrainingBar,
+    parse_overrides,
+    write_json_file,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy with TD3 while a shield keeps the evader safe."""
+
+    out: Path
+    """Run folder to write; never overwritten silently."""
+    scenario: ScenarioName = "paper"
+    """Preset (paper, paper-test) or a TOML or JSON file."""
+    shield: ShieldName = "game"
+    """Shield during training: none, paper or game."""
+    pursuer: PursuerName = "nash"
+    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still."""
+    episodes: int = 200
+    """Episodes to train for; with --resume the new total."""
+    seed: int = 0
+    """Seed of everything random; the same seed gives the same run on the same machine."""
+    set: Overrides = ()
+    """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""
+    learner: Overrides = ()
+    """Training options to change, such as discount=0.98 updates_per_decision=3."""
+    resume: bool = False
+    """Continue the run in --out where it stopped, bit for bit; its own settings are used."""
+    json: Path | None = None
+    """Also write the summary to this file."""
+
+
+def run(command: Train, console: Console) -> int:
+    """Run `sidestep train`; returns the exit status."""
+    from sidestep.learning import make_options, resume_settings
+    from sidestep.learning import train as run_training
+    from sidestep.world import load_scenario
+
+    if command.resume:
+        settings = resume_settings(command.out)
+        settings["episodes"] = max(settings["episodes"], command.episodes)
+    else:
+        settings = {
+            "scenario": load_scenario(command.scenario, **parse_overrides(command.set)),
+            "shield": command.shield,
+            "pursuer": command.pursuer,
+            "seed": command.seed,
+            "episodes": command.episodes,
+            "options": make_options(**parse_overrides(command.learner)),
+        }
+    with TrainingBar(console, f"training, {settings['shield']} shield") as show:
+        training = run_training(**settings, out=command.out, resume=command.resume, progress=show)
+    console.print(training_table(training.summary))
+    write_json_file(command.json, training.summary)
+    if training.interrupted:
+        console.print(f"Interrupted. Continue with: sidestep train --out {command.out} --resume")
+        return 130
+    console.print(f"Policy and summary in {command.out}; next: sidestep evaluate {command.out}")
+    return 0
+
+
+def training_table(summary: dict[str, Any]) -> Any:
+    """The figures of one training as a table."""
+    from rich.table import Table
+
+    table = Table(
+        title=f"Training, {summary['shield']} shield, {summary['pursuer']} pursuer", show_header=False
+    )
+    for key in (
+        "episodes", "safe_episodes", "captured", "collided", "reached", "timed_out", "converged_episode",
+        "final_return", "min_pursuer_clearance", "min_obstacle_clearance", "intervention_rate",
+        "infeasible_rate", "env_steps", "wall_seconds",
+    ):  # fmt: skip
+        value = summary[key]
+        shown = "never" if value is None and key == "converged_episode" else value
+        table.add_row(key.replace("_", " "), f"{shown:.4g}" if isinstance(shown, float) else str(shown))
+    return table
