@@ -9,12 +9,13 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from sidestep.commands import evaluate, report, reproduce, train
+from sidestep.commands import evaluate, falsify, report, reproduce, train
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
     evaluate.Evaluate: evaluate.run,
     reproduce.Reproduce: reproduce.run,
+    falsify.Falsify: falsify.run,
     report.Report: report.run,
 }
 
@@ -25,6 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
         Annotated[train.Train, subcommand("train")]
         | Annotated[evaluate.Evaluate, subcommand("evaluate")]
         | Annotated[reproduce.Reproduce, subcommand("reproduce")]
+        | Annotated[falsify.Falsify, subcommand("falsify")]
         | Annotated[report.Report, subcommand("report")],
         prog="sidestep",
         description="Safe reinforcement learning for a robot that is being pursued.",

@@ -1,0 +1,267 @@
+"""`sidestep falsify`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from sidestep.commands.common import (
+    CountBar,
+    Overrides,
+    ScenarioName,
+    ShieldName,
+    parse_overrides,
+    write_json_file,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sidestep.trials.falsification import Falsification, Progress
+
+
+@dataclass(frozen=True)
+class Falsify:
+    """Search for a pursuer, and a start, that break a shield; keep what is found, ready to play again."""
+
+    shield: ShieldName = "game"
+    """Shield to attack."""
+    policy: Annotated[str, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
+    """Run folder whose policy steers the evader, or goal-seeking for the untrained one."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder to write, never overwritten silently; runs/falsify-SHIELD by default."""
+    scenario: ScenarioName = "paper"
+    """Preset (paper, paper-test) or a TOML or JSON file."""
+    set: Overrides = ()
+    """Scenario fields to change, such as evader_speed=0.18 obstacle_count=0."""
+    goal: str = "both"
+    """What counts: capture, collision or both."""
+    attacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
+    """Attacks to use: pursuers, bang-bang, herder, cross-entropy, edge, learned; all by default."""
+    minutes: float | None = None
+    """Time to search for; 3 unless --episodes is given. With --resume on top of the time so far."""
+    episodes: int | None = None
+    """Episodes after which each attack ends."""
+    seconds: float = 60.0
+    """Longest episode, in seconds of its own time."""
+    batch: int = 256
+    """Episodes or plans tried at once; fewer make rounds shorter under a shield that is slow."""
+    most: int = 5
+    """Counterexamples to keep per attack and outcome (more if they go deeper, or break no assumption)."""
+    seed: int = 0
+    """Seed of everything random."""
+    resume: bool = False
+    """Go on with the search in --out; its own settings are used."""
+    replay: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Play this counterexample again, check that it ends the same, and draw it. Searches for nothing."""
+    json: Path | None = None
+    """Also write the figures to this file."""
+
+
+def run(command: Falsify, console: Console) -> int:
+    """Run `sidestep falsify`; returns the exit status."""
+    if command.replay is not None:
+        return _replay(command, console)
+    from sidestep.trials.falsification import ATTACKS, Plan, falsify
+    from sidestep.world import load_scenario
+
+    out = command.out or Path("runs") / f"falsify-{command.shield}"
+    plan = Plan(
+        seed=command.seed,
+        goal=command.goal,
+        attacks=command.attacks or ATTACKS,
+        batch=command.batch,
+        seconds=command.seconds,
+        most=command.most,
+    )
+    with SearchBar(console) as show:
+        found = falsify(
+            load_scenario(command.scenario, **parse_overrides(command.set)),
+            command.policy,
+            command.shield,
+            out=out,
+            plan=plan,
+            minutes=command.minutes,
+            episodes=command.episodes,
+            resume=command.resume,
+            progress=show,
+        )
+    console.print(attack_table(found))
+    for line in findings(found):
+        console.print(line, highlight=False)
+    write_json_file(command.json, found.summary)
+    _draw_all(found, console)
+    if found.interrupted:
+        console.print(f"Interrupted. Continue with: sidestep falsify --out {out} --resume")
+        return 130
+    if found.counterexamples:
+        first = found.counterexamples[0]
+        console.print(f"{len(found.counterexamples)} in {out}; next: sidestep falsify --replay {first}")
+    return 1 if found.inside else 0
+
+
+class SearchBar:
+    """Attack, episodes, steps per second, least clearances and counterexamples, on the error stream."""
+
+    def __init__(self, console: Console):
+        from rich.console import Console as RichConsole
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as RichProgress
+
+        self._bar = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=16),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=RichConsole(stderr=True),
+        )
+        self._task = self._bar.add_task("falsify", total=None, note="compiling")
+
+    def __enter__(self) -> Any:
+        self._bar.__enter__()
+        return self.update
+
+    def update(self, progress: Progress) -> None:
+        """Show where the search is."""
+        tally = progress.tally
+        speed = tally.control_periods / max(tally.seconds, 1e-9)
+        least = min(each.pursuer_clearance for each in progress.tallies.values())
+        note = (
+            f"{tally.episodes} episodes  {speed:,.0f} steps/s  least clearance {_millimetres(least)}  "
+            f"found {progress.counterexamples}"
+        )
+        done = None if progress.budget is None else min(progress.seconds, progress.budget)
+        self._bar.update(
+            self._task, description=progress.attack, total=progress.budget, completed=done, note=note
+        )
+
+    def __exit__(self, *error: Any) -> None:
+        self._bar.__exit__(*error)
+
+
+def _millimetres(metres: float | None) -> str:
+    from math import isfinite
+
+    if metres is None or not isfinite(metres):
+        return "-"
+    return f"{1e3 * metres:.3g} mm" if abs(metres) < 1.0 else f"{metres:.3g} m"
+
+
+def attack_table(found: Falsification) -> Any:
+    """What each attack came to."""
+    from rich.table import Table
+
+    summary = found.summary
+    table = Table(
+        "attack", "episodes", "caught", "collided", "clearance", "margin h", "obstacle", "kept",
+        title=f"Attacks on the shield {summary['shield']}",
+    )  # fmt: skip
+    for name, tally in summary["attacks"].items():
+        table.add_row(
+            name,
+            str(tally["episodes"]),
+            str(tally["captured"]),
+            str(tally["collided"]),
+            _millimetres(tally["pursuer_clearance"]),
+            _millimetres(tally["margin"]),
+            _millimetres(tally["obstacle_clearance"]),
+            str(tally["kept"]),
+        )
+    table.caption = (
+        "least clearance from the pursuer, margin to its capture set and clearance from an obstacle; "
+        f"{summary['control_periods']:,} control periods in {summary['seconds']:.0f} s, "
+        f"seed {summary['seed']}, goal {summary['goal']}"
+    )
+    return table
+
+
+def findings(found: Falsification) -> list[str]:
+    """What was found, by the assumption that was broken."""
+    from sidestep.trials.falsification import ASSUMPTIONS
+
+    summary = found.summary
+    if not summary["counterexamples"]:
+        return [f"No counterexample in {summary['episodes']} episodes."]
+    lines = [f"First counterexample after {summary['first_seconds']:.1f} s, compiling included."]
+    for name, count in summary["by_assumption"].items():
+        if name in ASSUMPTIONS:
+            lines.append(f"  {count} broke the assumption that {ASSUMPTIONS[name]}")
+        else:
+            lines.append(f"  {count} broke no assumption: theory or code is wrong")
+    return lines
+
+
+def _draw_all(found: Falsification, console: Console) -> None:
+    """Figures of the counterexamples that have none yet."""
+    from sidestep.trials.falsification import read_counterexample, replay
+
+    missing = [
+        path
+        for path in found.counterexamples
+        if not (found.folder / "figures" / f"{path.stem}.png").is_file()
+    ]
+    if not missing:
+        return
+    with CountBar(console, "figures") as show:
+        for number, path in enumerate(missing, start=1):
+            counterexample = read_counterexample(path)
+            played = replay(counterexample)
+            draw(counterexample, played, found.folder / "figures" / path.stem)
+            show(number, len(missing))
+
+
+def draw(counterexample: Any, played: Any, path: Path) -> Path:
+    """The figure of a counterexample that was played again; its PNG."""
+    from sidestep.trials.falsification import ASSUMPTIONS
+    from sidestep.views.counterexample_figure import counterexample_figure
+
+    about = counterexample.about
+    broken = ASSUMPTIONS.get(about["assumption"], "")
+    words = f"Broken: {broken}" if broken else "No assumption was broken"
+    png, _ = counterexample_figure(
+        played.scenario, played.trajectory, path, shield=about["shield"], words=words
+    )
+    return png
+
+
+def _replay(command: Falsify, console: Console) -> int:
+    from sidestep.trials.falsification import ASSUMPTIONS, read_counterexample, replay
+
+    assert command.replay is not None
+    counterexample = read_counterexample(command.replay)
+    about = counterexample.about
+    policy = None if command.policy == "goal-seeking" else command.policy
+    played = replay(counterexample, policy=policy)
+    trajectory = played.trajectory
+    told = f"{about['outcome'].replace('_', ' ')} after {about['time']:.2f} s"
+    console.print(
+        f"Shield {about['shield']}, policy {about['policy']['name']}, found by {about['attack']} "
+        f"(seed {about['seed']}): {told}",
+        highlight=False,
+    )
+    if played.exact:
+        console.print("Played again: the same, to the last bit.")
+    elif played.same:
+        console.print("Played again: the same outcome in the same period; the last digits differ.")
+    else:
+        seconds = trajectory.length * float(played.scenario.control_period)
+        console.print(f"Played again: NOT the same: {trajectory.outcome} after {seconds:.2f} s.")
+    console.print(
+        f"Least clearance from the pursuer {_millimetres(about['pursuer_clearance'])}, "
+        f"from an obstacle {_millimetres(about['obstacle_clearance'])}.",
+        highlight=False,
+    )
+    if about["assumption"] is None:
+        console.print(f"It broke no assumption of the shield: {about['words']}.", highlight=False)
+    else:
+        broken = ASSUMPTIONS.get(about["assumption"], about["assumption"])
+        console.print(f"Assumption broken: {broken}. Here {about['words']}.", highlight=False)
+    folder = command.out or command.replay.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    console.print(f"Figure: {draw(counterexample, played, folder / command.replay.stem)}", highlight=False)
+    facts = {**about, "same": played.same, "exact": played.exact}
+    write_json_file(command.json, facts)
+    return 0 if played.same else 1

@@ -1,0 +1,215 @@
+"""The attacks by name. Each comes in rounds: a batch of chases, with everything needed to play them again."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sidestep._arrays import real
+from sidestep.learning.td3 import TD3
+from sidestep.trials.falsification.attackers import Roster, bang_bang, built_in, herder, script
+from sidestep.trials.falsification.chases import Chase, Target, run_from
+from sidestep.trials.falsification.cross_entropy import Search
+from sidestep.trials.falsification.learned import Lessons, lesson, new_pupil
+from sidestep.trials.falsification.planned import Planning, chase_with_plans, search_starts
+from sidestep.trials.falsification.starts import draw_starts, freedom
+from sidestep.world import World
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round of an attack came to, chase by chase.
+
+    **Attributes:** `starts` worlds; `wheels (n, t, m, 2)` m/s driven; `steps` control periods to the end;
+    `outcome` indices into `OUTCOMES`, -1 for a chase given up while it ran; the least clearances and the
+    least margin h, m; `searched` control periods simulated besides, on the way to a plan.
+    """
+
+    starts: World
+    wheels: Float[np.ndarray, "n t m 2"]
+    steps: Int[np.ndarray, "n"]
+    outcome: Int[np.ndarray, "n"]
+    pursuer_clearance: Float[np.ndarray, "n"]
+    obstacle_clearance: Float[np.ndarray, "n"]
+    margin: Float[np.ndarray, "n"]
+    searched: int = 0
+
+    @property
+    def simulated(self) -> int:
+        """Control periods simulated."""
+        return int(self.steps.sum()) + self.searched
+
+
+def _round(starts: World, chases: Chase, wheels: Any, searched: int = 0) -> Round:
+    get = np.asarray
+    return Round(
+        jax.tree.map(get, starts),
+        get(wheels),
+        get(chases.steps),
+        get(chases.outcome),
+        get(chases.pursuer_clearance),
+        get(chases.obstacle_clearance),
+        get(chases.margin),
+        searched,
+    )
+
+
+class Attack(eqx.Module):
+    """A way of attacking. `state` (a pytree of arrays, or None) is what it learns from round to round."""
+
+    def init(self, key: PRNGKeyArray) -> Any:
+        """The state before the first round."""
+        return None
+
+    def rows(self, state: Any) -> dict[str, int]:
+        """How many first rows of which leaves of the state are worth storing, as `write_arrays` takes it."""
+        return {}
+
+    @abc.abstractmethod
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        """One round against `target`. **Returns** the new state and what happened."""
+
+
+def _starts(target: Target, key: PRNGKeyArray, count: int, edge_share: float) -> World:
+    """Start worlds; the first `edge_share` of them at the edge of the capture set."""
+    edge = np.arange(count) < round(edge_share * count)
+    return draw_starts(target.scenario, jax.random.split(key, count), edge)
+
+
+@final
+class Strategies(Attack):
+    """The built-in strategies in turn, from random starts and a quarter from the edge of the capture set."""
+
+    roster: Roster
+    chases: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, chase_key = jax.random.split(key)
+        starts = _starts(target, start_key, self.chases, 0.25)
+        numbers = jnp.arange(self.chases, dtype=jnp.int32) % len(self.roster.strategies)
+        keys = jax.random.split(chase_key, self.chases)
+        return None, _round(starts, *run_from(target, self.roster, numbers, starts, self.periods, keys))
+
+
+@final
+class Herding(Attack):
+    """Herders that strike from near and from afar, toward the nearest obstacle or the target."""
+
+    chases: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, chase_key, way_key, angle_key = jax.random.split(key, 4)
+        starts = _starts(target, start_key, self.chases, 0.25)
+        angles = jax.random.uniform(angle_key, (self.chases,), dtype=float, minval=0.2, maxval=1.2)
+        parts = (jax.random.bernoulli(way_key, 0.3, (self.chases,)), angles)
+        keys = jax.random.split(chase_key, self.chases)
+        return None, _round(starts, *run_from(target, herder, parts, starts, self.periods, keys))
+
+
+@eqx.filter_jit
+def _bang_bang_plans(scenario: Any, keys: PRNGKeyArray, periods: int, longest: Array) -> Array:
+    return jax.vmap(lambda key: bang_bang(scenario, key, periods, longest))(keys)
+
+
+@final
+class BangBang(Attack):
+    """Wheels full ahead or full back that switch at random, half of them from the edge of the capture set."""
+
+    chases: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, plan_key = jax.random.split(key)
+        starts = _starts(target, start_key, self.chases, 0.5)
+        keys = jax.random.split(plan_key, self.chases)
+        plans = _bang_bang_plans(target.scenario, keys, self.periods, real(40.0))
+        parts = (plans, jnp.zeros(self.chases, jnp.int32))
+        return None, _round(starts, *run_from(target, script, parts, starts, self.periods, keys))
+
+
+@final
+class CrossEntropy(Attack):
+    """Start and wheel speeds found together, then planned anew as the chase goes on."""
+
+    planning: Planning
+    chases: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+    edge: bool = eqx.field(static=True)
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, search_key, chase_key = jax.random.split(key, 3)
+        bases = _starts(target, start_key, self.chases, 1.0 if self.edge else 0.5)
+        free = real(freedom(target.scenario, edge=self.edge))
+        starts, knots, _ = search_starts(target, self.planning, bases, free, goal, search_key)
+        chases, wheels = chase_with_plans(target, self.planning, starts, knots, self.periods, goal, chase_key)
+        drawn, planned = self.planning.start_search, self.planning.search
+        plans = wheels.shape[1] // self.planning.execute
+        searched = self.chases * (
+            drawn.population * drawn.iterations * self.planning.opening
+            + plans * planned.population * planned.iterations * self.planning.horizon
+        )
+        return None, _round(starts, chases, wheels, searched)
+
+
+@final
+class Learned(Attack):
+    """A pursuer that TD3 trains to break this very shield."""
+
+    lessons: Lessons
+
+    def init(self, key: PRNGKeyArray) -> Any:
+        return new_pupil(self.lessons, key)
+
+    def rows(self, state: Any) -> dict[str, int]:
+        return {".ring.rows": min(int(state.ring.written), self.lessons.capacity)}
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, lesson_key = jax.random.split(key)
+        starts = _starts(target, start_key, self.lessons.chases, 0.5)
+        state, chases, wheels = lesson(target, self.lessons, state, starts, goal, lesson_key)
+        return state, _round(starts, chases, wheels)
+
+
+ATTACKS = ("pursuers", "bang-bang", "herder", "cross-entropy", "edge", "learned")
+"""Every attack by name, in the order in which they take turns."""
+
+
+def make_attack(name: str, batch: int = 256, periods: int = 1200) -> Attack:
+    """The attack `name`.
+
+    **Arguments:** `batch` chases or plans at once, which bounds memory and sets the length of a round;
+    `periods` the longest chase, in control periods.
+
+    **Raises** `ValueError` naming the known attacks.
+    """
+    few = max(1, batch // 32)
+    if name == "pursuers":
+        return Strategies(built_in(), batch, periods)
+    if name == "herder":
+        return Herding(batch, periods)
+    if name == "bang-bang":
+        return BangBang(batch, min(periods, 600))
+    if name == "cross-entropy":
+        drawn = Search(64, 8, 6)
+        return CrossEntropy(
+            Planning(Search(48, 6, 3), drawn, 4, 64, 8, 80), few, min(periods, 400), edge=False
+        )
+    if name == "edge":
+        drawn = Search(64, 8, 8)
+        return CrossEntropy(
+            Planning(Search(48, 6, 3), drawn, 1, 24, 4, 32), few, min(periods, 160), edge=True
+        )
+    if name == "learned":
+        algorithm = TD3(discount=0.97, actor_learning_rate=1e-3, critic_learning_rate=1e-3, hidden=(128, 128))
+        chases = max(1, batch // 8)
+        return Learned(Lessons(algorithm, chases=chases, decisions=max(1, min(periods, 400) // 4)))
+    raise ValueError(f"no attack {name!r}; use one of {', '.join(map(repr, ATTACKS))}")

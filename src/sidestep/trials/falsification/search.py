@@ -1,0 +1,421 @@
+"""The search for counterexamples: attacks in turn until the time is over, everything found kept on disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import sidestep
+from sidestep.learning.checkpoints import read_arrays, write_arrays
+from sidestep.learning.policy import load_policy
+from sidestep.learning.records import (
+    OUTCOMES,
+    RunError,
+    append_metrics,
+    create_run,
+    json_safe,
+    open_run,
+    read_metrics,
+    write_summary,
+)
+from sidestep.safety import Shield, as_shield
+from sidestep.trials.falsification.attacks import ATTACKS, Round, make_attack
+from sidestep.trials.falsification.chases import GOALS, Target
+from sidestep.trials.falsification.counterexamples import (
+    CUSTOM,
+    Counterexample,
+    describe_policy,
+    make_counterexample,
+    play,
+    shield_name,
+    write_counterexample,
+)
+from sidestep.trials.falsification.verdict import judge
+from sidestep.trials.policies import GOAL_SEEKING, as_policy
+from sidestep.world import Scenario, load_scenario, scenario_to_dict
+
+_WANTED = {"capture": ("captured",), "collision": ("collided",), "both": ("captured", "collided")}
+_EXAMINED = 16
+_DEEPER = 1e-4
+_DEFAULT_MINUTES = 3.0
+_COUNTERS = ("rounds", "episodes", "control_periods", "seconds", "captured", "collided", "unconfirmed")
+_LEAST = ("pursuer_clearance", "obstacle_clearance", "margin")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is searched for, and how: everything that a resumed search must not change.
+
+    `batch` chases or plans at once; `seconds` the longest chase; `most` counterexamples kept per attack and
+    outcome (more only if they get 0.1 mm deeper, or broke no assumption).
+    """
+
+    seed: int = 0
+    goal: str = "both"
+    attacks: tuple[str, ...] = ATTACKS
+    batch: int = 256
+    seconds: float = 60.0
+    most: int = 5
+    guaranteed_clearance: float | None = None
+
+
+@dataclass
+class Tally:
+    """What one attack has come to. Clearances and margin: the least, m. `first` s into the search."""
+
+    rounds: int = 0
+    episodes: int = 0
+    control_periods: int = 0
+    seconds: float = 0.0
+    captured: int = 0
+    collided: int = 0
+    unconfirmed: int = 0
+    pursuer_clearance: float = np.inf
+    obstacle_clearance: float = np.inf
+    margin: float = np.inf
+    first: float | None = None
+    kept: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, line: Mapping[str, Any]) -> None:
+        """Count one round, as its line in `metrics.jsonl` says."""
+        for name in _COUNTERS:
+            setattr(self, name, getattr(self, name) + (1 if name == "rounds" else line[name]))
+        for name in _LEAST:
+            value = line[name]
+            setattr(self, name, min(getattr(self, name), np.inf if value is None else value))
+        self.kept += line["counterexamples"]
+        if self.first is None and line["counterexamples"]:
+            self.first = line["at"]
+
+    def deepest(self, outcome: str) -> tuple[int, float]:
+        """How many counterexamples with this outcome are kept, and the least clearance among them."""
+        name = _clearance_of(outcome)
+        depths = [entry[name] for entry in self.kept if entry["outcome"] == outcome]
+        return len(depths), min(depths, default=np.inf)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where the search is: the attack that has just played a round, its tally, and all of them."""
+
+    attack: str
+    tally: Tally
+    tallies: Mapping[str, Tally]
+    seconds: float
+    budget: float | None
+
+    @property
+    def counterexamples(self) -> int:
+        """Counterexamples kept so far."""
+        return sum(len(tally.kept) for tally in self.tallies.values())
+
+
+@dataclass(frozen=True)
+class Falsification:
+    """A search and what it found. `folder/counterexamples` holds one file per counterexample kept."""
+
+    folder: Path
+    summary: Mapping[str, Any]
+    tallies: Mapping[str, Tally]
+    interrupted: bool
+
+    @property
+    def counterexamples(self) -> list[Path]:
+        """Files of the counterexamples kept, in the order in which they were found."""
+        entries = [entry for tally in self.tallies.values() for entry in tally.kept]
+        return [self.folder / entry["file"] for entry in sorted(entries, key=lambda entry: entry["at"])]
+
+    @property
+    def inside(self) -> list[Path]:
+        """Files of those that broke no assumption."""
+        entries = [entry for tally in self.tallies.values() for entry in tally.kept]
+        return [self.folder / entry["file"] for entry in entries if entry["assumption"] is None]
+
+
+def _clearance_of(outcome: str) -> str:
+    return "pursuer_clearance" if outcome == "captured" else "obstacle_clearance"
+
+
+def check_plan(scenario: Scenario, plan: Plan) -> None:
+    """**Raises** `ValueError` naming what cannot be searched for, its value and what is allowed."""
+    if plan.goal not in GOALS:
+        raise ValueError(f"goal = {plan.goal!r}: it must be one of {', '.join(map(repr, GOALS))}")
+    if plan.goal == "collision" and scenario.obstacle_count == 0:
+        raise ValueError("goal = 'collision', but the scenario has no obstacle to collide with")
+    unknown = [name for name in plan.attacks if name not in ATTACKS]
+    if unknown or not plan.attacks:
+        raise ValueError(f"attacks = {list(plan.attacks)}: they must be some of {', '.join(ATTACKS)}")
+    if len(set(plan.attacks)) < len(plan.attacks):
+        raise ValueError(f"attacks = {list(plan.attacks)}: each may be named only once")
+    for name, least in (("batch", 1), ("most", 1), ("seed", 0)):
+        value = getattr(plan, name)
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
+    if not np.isfinite(plan.seconds) or plan.seconds < float(scenario.control_period):
+        raise ValueError(f"seconds = {plan.seconds!r}: it must be at least one control period")
+
+
+def falsify(
+    scenario: Scenario,
+    policy: Any,
+    shield: str | Shield,
+    *,
+    out: str | Path,
+    plan: Plan | None = None,
+    minutes: float | None = None,
+    episodes: int | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> Falsification:
+    """Search for a pursuer, and a start, that captures the evader or makes it collide.
+
+    Attacks take turns, the one that has had the least time next; everything in round r of an attack follows
+    from the seed, the attack and r, whatever else was searched. Whatever loses the evader is played again
+    alone, through the one control step, before it is believed and kept (see `Plan.most`).
+
+    **Arguments:** `policy` `goal-seeking`, a run folder or any policy; `shield` a name or a `Shield`; `out`
+    the folder to write; `minutes` to search for (3 unless `episodes` is given), when resuming on top of the
+    time it has had; `episodes` after which an attack ends; `resume` to go on with the search in `out`, whose
+    settings are used (a policy or shield without a name must be given again); `progress` is called after each
+    round.
+
+    Ctrl-C ends the search with what it has found.
+
+    **Raises** `ValueError` for settings that make no sense (see `check_plan`), a folder that is in use, or
+    one to resume that holds no search.
+    """
+    folder = Path(out)
+    source = policy if isinstance(policy, (str, Path)) else None
+    if minutes is None and episodes is None:
+        minutes = _DEFAULT_MINUTES
+    if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
+        raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
+    if episodes is not None and (isinstance(episodes, bool) or episodes < 1):
+        raise ValueError(f"episodes = {episodes!r}: it must be a whole number of at least 1")
+    plan = plan or Plan()
+    if resume:
+        scenario, source, shield, plan = _stored(folder, policy, shield)
+    elif folder.exists():
+        check_plan(scenario, plan)
+    policy = _load(source) if source is not None else policy
+    check_plan(scenario, plan)
+    shield_called = shield_name(shield, scenario)
+    target = Target(scenario, as_policy(policy, scenario), as_shield(shield, scenario))
+    about = {
+        "kind": "falsification",
+        "scenario": scenario_to_dict(scenario),
+        "shield": shield_called,
+        "policy": describe_policy(policy, source),
+        "version": sidestep.__version__,
+        **{name: getattr(plan, name) for name in Plan.__dataclass_fields__},
+    }
+    if resume:
+        _check_policy(folder, about["policy"])
+    else:
+        create_run(folder, about)
+    (folder / "counterexamples").mkdir(exist_ok=True)
+    hunt = _Hunt(folder, target, shield_called, about, plan, progress)
+    return hunt.run(minutes, episodes)
+
+
+def _load(source: str | Path) -> Any:
+    return source if source == GOAL_SEEKING else load_policy(source)
+
+
+def _stored(folder: Path, policy: Any, shield: Any) -> tuple[Scenario, Any, Any, Plan]:
+    """Scenario, policy's source, shield and plan of a search begun before."""
+    config = open_run(folder)
+    if config.get("kind") != "falsification":
+        raise RunError(
+            f"{folder} holds no search for counterexamples; leave out --resume, or name its folder"
+        )
+    scenario = load_scenario("paper", **config["scenario"])
+    values = {name: config[name] for name in Plan.__dataclass_fields__}
+    values["attacks"] = tuple(values["attacks"])
+    shield = shield if config["shield"] == CUSTOM else config["shield"]
+    named = config["policy"]["name"]
+    source = named if named != CUSTOM else policy if isinstance(policy, (str, Path)) else None
+    return scenario, source, shield, Plan(**values)
+
+
+def _check_policy(folder: Path, policy: Mapping[str, Any]) -> None:
+    stored = open_run(folder)["policy"]
+    if stored.get("digest") != policy.get("digest"):
+        raise RunError(
+            f"{folder} was searched with other weights of the policy {stored['name']}; start another search"
+        )
+
+
+class _Hunt:
+    """The search while it runs."""
+
+    def __init__(
+        self,
+        folder: Path,
+        target: Target,
+        shield: str,
+        about: dict[str, Any],
+        plan: Plan,
+        progress: Callable[[Progress], None] | None,
+    ):
+        self.folder, self.target, self.shield, self.about, self.plan = folder, target, shield, about, plan
+        self.progress = progress
+        periods = max(1, round(plan.seconds / float(target.scenario.control_period)))
+        self.limit = min(periods, target.scenario.episode_steps)
+        self.attacks = {name: make_attack(name, plan.batch, self.limit) for name in plan.attacks}
+        self.tallies = {name: Tally() for name in plan.attacks}
+        for line in read_metrics(folder):
+            self.tallies[line["attack"]].add(line)
+        self.before = sum(tally.seconds for tally in self.tallies.values())
+        self.states = {name: self._state(name) for name in plan.attacks}
+        self.began = time.perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of search, those before a resume included."""
+        return self.before + time.perf_counter() - self.began
+
+    def _key(self, name: str, number: int) -> Any:
+        attack = jax.random.fold_in(jax.random.key(self.plan.seed), ATTACKS.index(name))
+        return jax.random.fold_in(attack, number)
+
+    def _state_file(self, name: str) -> Path:
+        return self.folder / "checkpoints" / f"{name}.npz"
+
+    def _state(self, name: str) -> Any:
+        # Rounds count from 0; the last number is left for what an attack begins with.
+        state = self.attacks[name].init(self._key(name, 2**31 - 1))
+        if state is not None and self.tallies[name].rounds and self._state_file(name).is_file():
+            state, _ = read_arrays(self._state_file(name), state)
+        return state
+
+    def run(self, minutes: float | None, episodes: int | None) -> Falsification:
+        """Rounds until the time is over or every attack has played its episodes."""
+        budget = None if minutes is None else self.before + 60.0 * minutes
+        interrupted = False
+        try:
+            while budget is None or self.elapsed < budget:
+                waiting = [
+                    name for name in self.plan.attacks
+                    if episodes is None or self.tallies[name].episodes < episodes
+                ]  # fmt: skip
+                if not waiting:
+                    break
+                name = min(waiting, key=lambda name: self.tallies[name].seconds)
+                self._round(name)
+                if self.progress is not None:
+                    self.progress(Progress(name, self.tallies[name], self.tallies, self.elapsed, budget))
+        except KeyboardInterrupt:
+            interrupted = True
+        summary = self._summary(interrupted)
+        write_summary(self.folder, summary)
+        return Falsification(self.folder, summary, self.tallies, interrupted)
+
+    def _round(self, name: str) -> None:
+        began, tally = time.perf_counter(), self.tallies[name]
+        key = self._key(name, tally.rounds)
+        attack = self.attacks[name]
+        state, result = attack.round(self.target, self.plan.goal, self.states[name], key)
+        kept, unconfirmed = self._keep(name, result)
+        self.states[name] = state
+        if state is not None:
+            write_arrays(self._state_file(name), state, rows=attack.rows(state), round=tally.rounds)
+        line = json_safe(
+            {
+                "attack": name,
+                "round": tally.rounds,
+                "episodes": len(result.steps),
+                "control_periods": result.simulated,
+                "captured": np.sum(result.outcome == OUTCOMES.index("captured")),
+                "collided": np.sum(result.outcome == OUTCOMES.index("collided")),
+                "unconfirmed": unconfirmed,
+                **{which: np.min(getattr(result, which)) for which in _LEAST},
+                "counterexamples": kept,
+                "seconds": time.perf_counter() - began,
+                "at": self.elapsed,
+            }
+        )
+        append_metrics(self.folder, [line])
+        tally.add(line)
+
+    def _keep(self, name: str, result: Round) -> tuple[list[dict[str, Any]], int]:
+        """Play the lost chases again, the deepest first, and keep those worth it."""
+        kept: list[dict[str, Any]] = []
+        unconfirmed = 0
+        for outcome in _WANTED[self.plan.goal]:
+            clearances = getattr(result, _clearance_of(outcome))
+            lost = np.flatnonzero(result.outcome == OUTCOMES.index(outcome))
+            count, least = self.tallies[name].deepest(outcome)
+            for number in lost[np.argsort(clearances[lost], kind="stable")][:_EXAMINED]:
+                found = self._examine(name, result, int(number))
+                if found is None:
+                    unconfirmed += 1
+                    continue
+                depth = found.about[_clearance_of(outcome)]
+                inside = found.about["assumption"] is None
+                if count >= self.plan.most and depth >= least - _DEEPER and not inside:
+                    continue
+                count, least = count + 1, min(least, depth)
+                kept.append(self._store(name, int(number), found))
+        return kept, unconfirmed
+
+    def _examine(self, name: str, result: Round, number: int) -> Counterexample | None:
+        """The counterexample of a lost chase; None if it is not lost when played alone (rounding)."""
+        world = jax.tree.map(lambda leaf: leaf[number], result.starts)
+        wheels = result.wheels[number, : result.steps[number]]
+        scenario, guaranteed = self.target.scenario, self.plan.guaranteed_clearance
+        trajectory = play(scenario, self.target.policy, self.target.shield, world, wheels, self.limit)
+        if trajectory.outcome != OUTCOMES[result.outcome[number]]:
+            return None
+        verdict = judge(scenario, self.shield, trajectory, guaranteed)
+        return make_counterexample(
+            scenario,
+            trajectory,
+            wheels,
+            shield=self.shield,
+            policy=self.about["policy"],
+            seed=self.plan.seed,
+            attack=name,
+            round=self.tallies[name].rounds,
+            limit=self.limit,
+            assumption=verdict.assumption,
+            words=verdict.words,
+            guaranteed_clearance=guaranteed,
+        )
+
+    def _store(self, name: str, number: int, found: Counterexample) -> dict[str, Any]:
+        file = f"counterexamples/{name}-{self.tallies[name].rounds:04d}-{number:03d}.npz"
+        write_counterexample(self.folder / file, found)
+        told = ("outcome", "time", "pursuer_clearance", "obstacle_clearance", "assumption", "words")
+        return {"file": file, "attack": name, "at": self.elapsed, **{key: found.about[key] for key in told}}
+
+    def _summary(self, interrupted: bool) -> dict[str, Any]:
+        attacks = {}
+        for name, tally in self.tallies.items():
+            figures = {key: getattr(tally, key) for key in (*_COUNTERS, *_LEAST, "first")}
+            attacks[name] = {**figures, "kept": len(tally.kept)}
+        found = sorted((e for tally in self.tallies.values() for e in tally.kept), key=lambda e: e["at"])
+        assumptions = [entry["assumption"] for entry in found]
+        return json_safe(
+            {
+                **self.about,
+                "seconds": self.elapsed,
+                "interrupted": interrupted,
+                "episodes": sum(tally.episodes for tally in self.tallies.values()),
+                "control_periods": sum(tally.control_periods for tally in self.tallies.values()),
+                "captured": sum(tally.captured for tally in self.tallies.values()),
+                "collided": sum(tally.collided for tally in self.tallies.values()),
+                "first_seconds": found[0]["at"] if found else None,
+                "kept": len(found),
+                "inside_assumptions": sum(name is None for name in assumptions),
+                "by_assumption": {str(name): assumptions.count(name) for name in dict.fromkeys(assumptions)},
+                "attacks": attacks,
+                "counterexamples": found,
+            }
+        )

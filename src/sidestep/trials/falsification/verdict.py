@@ -1,0 +1,152 @@
+"""Which assumption of a shield's guarantee a counterexample broke, if any."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from sidestep.pursuit import CaptureGame
+from sidestep.safety import Status
+from sidestep.trials.captures import explain_capture
+from sidestep.trials.falsification.attackers import escape_margin
+from sidestep.trials.rollout import Trajectory
+from sidestep.world import Scenario, World
+
+ASSUMPTIONS: dict[str, str] = {
+    "promise": "the shield promises something",
+    "forwards": "the pursuer never drives backwards onto the evader (the paper's row)",
+    "row": "the evader is fast enough to keep the row (the paper's row)",
+    "straight": "the pursuer drives straight on at full speed (the paper's row)",
+    "start": "the start lies outside the capture set and clear of obstacles",
+    "one-pursuer": "there is one pursuer",
+    "winner": "the capture distance is at most l_max, so that the evader can escape at all",
+    "finite": "the policy and the world are finite numbers",
+    "sampling": "the shield decides in continuous time, not once in a control period",
+    "rounding": "numbers are exact",
+    "slow-obstacles": "obstacles are slower than the evader",
+    "alone": "the rows towards pursuer and obstacles can be kept together",
+}
+"""What each shield's guarantee takes for granted, by the names that verdicts use."""
+
+_PURSUIT_SHIELDS = ("game", "joint")
+_ROUNDING = 64.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Why a counterexample could happen: the `assumption` it broke (a key of `ASSUMPTIONS`), and how.
+
+    None means that it broke none: theory or code is wrong.
+    """
+
+    assumption: str | None
+    words: str
+
+    @property
+    def inside(self) -> bool:
+        """Whether it happened inside the shield's assumptions."""
+        return self.assumption is None
+
+
+def judge(
+    scenario: Scenario, shield: str, trajectory: Trajectory, guaranteed_clearance: float | None = None
+) -> Verdict:
+    """The assumption that an episode lost under `shield` broke.
+
+    **Arguments:** `guaranteed_clearance` what a certificate for this control period promises as the least
+    clearance from the pursuer, m (below 0: the evader may be caught, but never deeper than that); without
+    one, sampling excuses a capture when the control period is longer than half of T_est = 2 b m/(V l),
+    m = b rho - l tan S, up to which none was ever seen.
+
+    **Raises** `ValueError` for an episode that ended neither in a capture nor in a collision.
+    """
+    outcome = trajectory.outcome
+    if outcome not in ("captured", "collided"):
+        raise ValueError(f"the episode ended '{outcome}', neither captured nor collided")
+    if shield == "none":
+        return Verdict("promise", "there is no shield")
+    if shield not in ("paper", *_PURSUIT_SHIELDS):
+        return Verdict("promise", f"nothing is known of what the shield {shield!r} promises")
+    common = _before_all_else(scenario, trajectory)
+    if common is not None:
+        return common
+    if outcome == "collided":
+        return _judge_collision(scenario, shield, trajectory)
+    if shield == "paper":
+        return _judge_paper(scenario, trajectory)
+    return _judge_capture(scenario, trajectory, guaranteed_clearance)
+
+
+def _before_all_else(scenario: Scenario, trajectory: Trajectory) -> Verdict | None:
+    start: World = jax.tree.map(lambda leaf: leaf[0], trajectory.worlds)
+    h = float(escape_margin(scenario, start))
+    if h <= 0.0:
+        return Verdict("start", f"it starts {-h:.3g} m inside the capture set")
+    gaps = np.hypot(*np.asarray(start.obstacles[:, :2] - start.evader).T) - float(scenario.collision_distance)
+    if np.any(gaps <= 0.0):
+        return Verdict("start", f"it starts {-float(gaps.min()):.3g} m inside an obstacle")
+    if np.any(np.asarray(trajectory.status) == Status.INVALID):
+        return Verdict("finite", "the shield was given numbers that are not finite")
+    return None
+
+
+def _judge_collision(scenario: Scenario, shield: str, trajectory: Trajectory) -> Verdict:
+    speeds = np.hypot(*np.asarray(trajectory.worlds.obstacles[0, :, 2:]).T)
+    fastest = float(np.max(speeds, initial=0.0))
+    if fastest > float(scenario.evader_speed):
+        return Verdict("slow-obstacles", f"an obstacle drifts at {fastest:.3g} m/s")
+    stuck = np.flatnonzero(np.asarray(trajectory.status) == Status.INFEASIBLE)
+    if len(stuck):
+        since = float(stuck[0]) * float(scenario.control_period)
+        words = f"from {since:.2f} s on not all rows could be kept"
+        if shield == "joint":
+            words += "; what `joint` adds to them is measured, not proved"
+        return Verdict("alone", words)
+    return Verdict(None, "all rows could be kept all the time, and still it collided")
+
+
+def _judge_paper(scenario: Scenario, trajectory: Trajectory) -> Verdict:
+    cause = explain_capture(scenario, trajectory).cause
+    if cause == "reversing":
+        return Verdict("forwards", "the pursuer backed onto the evader, which the row took for leaving")
+    if cause == "head-on":
+        return Verdict("row", "no velocity of the evader satisfied the row")
+    return Verdict("straight", "the pursuer did not drive as the row takes it to")
+
+
+def _judge_capture(scenario: Scenario, trajectory: Trajectory, guaranteed: float | None) -> Verdict:
+    game = CaptureGame.of(scenario)
+    if scenario.pursuer_count != 1:
+        return Verdict("one-pursuer", f"there are {scenario.pursuer_count} pursuers")
+    largest, reach = float(game.largest_capture_distance), float(scenario.capture_distance)
+    if not bool(game.evader_can_escape):
+        return Verdict("winner", f"the capture distance {reach:.4g} m exceeds l_max = {largest:.4g} m")
+    clearance = float(np.min(np.asarray(trajectory.events.pursuer_clearance)))
+    extent = float(np.max(np.abs(np.asarray(trajectory.worlds.evader)), initial=1.0))
+    exact = _ROUNDING * float(np.finfo(np.asarray(trajectory.worlds.evader).dtype).eps) * extent
+    if clearance > -exact:
+        return Verdict("rounding", f"the evader was touched by {-clearance:.2g} m, which is rounding")
+    depth = f"caught {-1e3 * clearance:.3g} mm deep"
+    if guaranteed is not None:
+        allowed = f"the certificate for this control period allows {max(0.0, -1e3 * guaranteed):.3g} mm"
+        if clearance >= guaranteed - exact:
+            return Verdict("sampling", f"{depth}; {allowed}")
+        return Verdict(None, f"{depth}, but {allowed}")
+    period, safe = float(scenario.control_period), _safe_period(scenario, game)
+    if period > safe:
+        return Verdict(
+            "sampling",
+            f"{depth}; the control period {1e3 * period:.3g} ms is longer than the {1e3 * safe:.2g} ms up to "
+            "which none was ever seen",
+        )
+    return Verdict(None, f"{depth}, at a control period of {1e3 * period:.3g} ms")
+
+
+def _safe_period(scenario: Scenario, game: CaptureGame) -> float:
+    """T_est/2 in s; infinite for an evader at least as fast."""
+    usable, axle = float(game.usable_angle), float(game.half_axle)
+    speed, reach = float(game.pursuer_speed), float(game.capture_distance)
+    spare = axle * np.cos(usable) - reach * np.tan(usable)
+    return float(axle * max(spare, 0.0) / (speed * reach)) if usable > 0.0 else np.inf
