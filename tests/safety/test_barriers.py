@@ -32,6 +32,9 @@ def _worlds(n, seed=0, obstacles=2, pursuers=2):
                     [rng.normal(size=(n, obstacles, 2)), 0.05 * rng.normal(size=(n, obstacles, 2))], axis=-1
                 ),
                 rng.normal(size=(n, 2)),
+                np.zeros(n),
+                np.zeros((n, 2)),
+                rng.uniform(-0.2, 0.2, (n, pursuers, 2)),
             )
         )
     )
@@ -41,12 +44,15 @@ def _assumed_motion(name, scenario, evader, robot, memory, duration):
     """Where the robot is after `duration` if it moves as the barrier takes it to move now."""
     if name == "obstacle":
         return jnp.concatenate([robot[:2] + duration * robot[2:], robot[2:]])
+    pose, known = robot[:3], robot[3:]
     if name == "range":
         wheels = jnp.full(2, scenario.pursuer_speed)
-    else:
-        game, z = CaptureGame.of(scenario), to_pursuer_frame(evader, robot)
+    elif name == "pursuit":
+        game, z = CaptureGame.of(scenario), to_pursuer_frame(evader, pose)
         wheels = game.steer_against(z, game.barrier(z, memory)[1])
-    return drive(robot, wheels, scenario.pursuer_half_axle, duration)
+    else:
+        wheels = known
+    return jnp.concatenate([drive(pose, wheels, scenario.pursuer_half_axle, duration), known])
 
 
 @every_barrier
@@ -129,7 +135,7 @@ def test_rows_are_ordered_like_their_robots_and_every_count_works(precision, nam
 def test_never_nan_on_top_of_the_other_robot_or_on_its_axis(precision, name):
     scenario, barrier = load_scenario("paper"), BARRIERS[name]
     evader = jnp.zeros(2)
-    size = 4 if name == "obstacle" else 3
+    size = {"obstacle": 4, "pursuit, velocity known": 5}.get(name, 3)
     for place in ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (1e-30, 0.0)):
         robot = jnp.zeros(size).at[:2].set(jnp.asarray(place, float))
         for side in (-1.0, 0.0, 1.0):

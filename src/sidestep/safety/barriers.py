@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, Flag, Scalar, real
-from sidestep.pursuit.game import CaptureGame
+from sidestep.pursuit.game import CaptureGame, turning_moment
 from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.robots import body_velocity
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
@@ -190,8 +191,20 @@ class RangeBarrier(Barrier):
 class PursuitBarrier(Barrier):
     """The barrier of the capture game: holds against every admissible motion of the pursuer.
 
-    h is the signed distance from the capture set, see `CaptureGame.barrier`, and the row is
-    n.u >= V max(|n_x|, |sigma|/b) - alpha(h), the first term being the fastest the pursuer can lower h.
+    h is the signed distance from the capture set, see `CaptureGame.barrier`. Its row has two forms, with
+    sigma = n_x z_y - n_y z_x the moment of n about the pursuer:
+
+    - pursuer's motion unknown (the default): n.u >= V max(|n_x|, |sigma|/b) - alpha(h), the first term
+      being the fastest that any wheel speeds can lower h.
+    - `known_velocity=True`: n.u >= v n_x - omega sigma - alpha(h), with the v and omega of
+      `world.wheel_speeds`. That is h' >= -alpha(h) along the pursuer's actual motion, it never asks for
+      more than the first form, and so it interferes less. **It is only as good as those wheel speeds.**
+      Whoever calls must have put in those of the period that is about to begin: a robot that announces its
+      commands, or one whose next command can be computed. The world of a simulation or of a measurement holds
+      those of the period that has just ended, and a pursuer may turn them round at will: the row is then
+      too weak by up to |n_x| |dv| + |sigma| |domega| <= 2 V max(|n_x|, |sigma|/b) and carries no worst-case
+      guarantee. Wheel speeds are clipped to [-V, V]; a pursuer whose wheel speeds are not finite counts as
+      one of unknown motion.
 
     With h_max = l_max - l, alpha(h) = gamma min(h, h_max) + max(gamma, 1.5 (V/b) tan S) (h - h_max)+: the
     gain gamma as far as any gain will do (0 <= h <= h_max), and beyond it at least half again the slope that
@@ -204,22 +217,48 @@ class PursuitBarrier(Barrier):
     row stays feasible: across the axis by |y|, that is |y| <= cos S (b rho - (l + h) tan S + (b/V) alpha(h)),
     which for h = 0 is m cos S with m = b rho - l tan S. It is left at half of that, for the evader's own
     side, whose h is larger: with 2 |y| sin S = h_own - h, the change never lowers the value.
+
+    A robot is (x, y, heading), with known velocity followed by its wheel speeds (left, right; m/s).
     """
 
-    def robots(self, world: World) -> Float[Array, "n 3"]:
+    known_velocity: bool = eqx.field(static=True, default=False)
+
+    def robots(self, world: World) -> Float[Array, "n d"]:
+        if self.known_velocity:
+            return jnp.concatenate([world.pursuers, world.wheel_speeds], axis=-1)
         return world.pursuers
 
     def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
-        return CaptureGame.of(scenario).barrier(to_pursuer_frame(evader, robot), memory)[0]
+        return CaptureGame.of(scenario).barrier(to_pursuer_frame(evader, robot[:3]), memory)[0]
 
     def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
         game = CaptureGame.of(scenario)
-        z = to_pursuer_frame(evader, robot)
+        z = to_pursuer_frame(evader, robot[:3])
         ahead, left = normal = game.barrier(z, memory)[1]
         cosine, sine = jnp.cos(robot[2]), jnp.sin(robot[2])
         world_normal = jnp.stack([cosine * ahead - sine * left, sine * ahead + cosine * left])
         # A pursuer that turns at no cost (b = 0) has no finite rate; any that cannot be kept says the same.
-        return world_normal, jnp.minimum(game.pursuit_rate(z, normal), 1e3 * game.pursuer_speed)
+        rate = jnp.minimum(game.pursuit_rate(z, normal), 1e3 * game.pursuer_speed)
+        if self.known_velocity:
+            rate = self._known_rate(game, z, normal, robot[3:], rate)
+        return world_normal, rate
+
+    def _known_rate(
+        self,
+        game: CaptureGame,
+        z: Float[Array, "2"],
+        normal: Float[Array, "2"],
+        wheel_speeds: Float[AnyArray, "2"],
+        fastest: Scalar,
+    ) -> Scalar:
+        """v n_x - omega sigma (m/s), or `fastest` where the motion is not known or turning is free."""
+        known = jnp.all(jnp.isfinite(wheel_speeds)) & (game.half_axle > 0.0)
+        wheels = jnp.where(known, wheel_speeds, 0.0)
+        wheels = jnp.clip(wheels, -game.pursuer_speed, game.pursuer_speed)
+        speed, turn_rate = body_velocity(wheels, jnp.where(game.half_axle > 0.0, game.half_axle, 1.0))
+        rate = speed * normal[0] - turn_rate * turning_moment(z, normal)
+        # Rounding must not make the row ask for more than the worst case, which is known to be feasible.
+        return jnp.where(known, jnp.minimum(rate, fastest), fastest)
 
     def allowance(self, scenario: Scenario, h: Any) -> Scalar:
         game = CaptureGame.of(scenario)
@@ -231,7 +270,7 @@ class PursuitBarrier(Barrier):
 
     def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
         game = CaptureGame.of(scenario)
-        z = to_pursuer_frame(evader, robot)
+        z = to_pursuer_frame(evader, robot[:3])
         own_side = jnp.where(z[1] < 0.0, -1.0, 1.0).astype(z.dtype)
         if memory is None:
             return own_side
@@ -260,5 +299,6 @@ BARRIERS: dict[str, Barrier] = {
     "obstacle": ObstacleBarrier(),
     "range": RangeBarrier(),
     "pursuit": PursuitBarrier(),
+    "pursuit, velocity known": PursuitBarrier(known_velocity=True),
 }
 """Every barrier by name."""
