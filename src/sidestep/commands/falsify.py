@@ -40,7 +40,7 @@ class Falsify:
     goal: str = "both"
     """What counts: capture, collision or both."""
     attacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
-    """Attacks to use: pursuers, bang-bang, herder, cross-entropy, edge, learned; all by default."""
+    """Attacks: pursuers, bang-bang, herder, sideswipe, cross-entropy, edge, learned; all by default."""
     minutes: float | None = None
     """Time to search for; 3 unless --episodes is given. With --resume on top of the time so far."""
     episodes: int | None = None

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Scalar, norm
+from sidestep._arrays import AnyArray, Scalar, norm
 from sidestep.pursuit import PURSUERS, Pursuer, make_pursuer
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
+from sidestep.world.robots import wheels_from_body
 
 _STAND_OFF = 0.1
 
@@ -108,7 +109,58 @@ def herder(part: tuple[Bool[Array, ""], Float[Array, ""]]) -> Herder:
     return Herder(*part)
 
 
-def _unit(offset: Float[Array, "2"]) -> Float[Array, "2"]:
+@final
+class Sideswiper(Pursuer):
+    """Drives alongside the evader, between it and its target, lets it come close, and swings in.
+
+    Beside the pursuer the evader may come as near as it likes, for there contact cannot be forced. But within
+    one control period the pursuer gains V^2 T^2/(8 b) by turning in with the inner wheel at rest, before a
+    sampled shield can answer. It strikes once less than the share `patience` of that is left; `lead` (rad) is
+    how far from the evader's way to its target it waits.
+    """
+
+    patience: Float[Array, "*batch"]
+    lead: Float[Array, "*batch"]
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        speed, axle, period = scenario.pursuer_speed, scenario.pursuer_half_axle, scenario.control_period
+        pose = world.pursuer
+        z = to_pursuer_frame(world.evader, pose)
+        onward = _unit(world.target - world.evader)
+        left = jnp.where(z[1] < 0.0, -1.0, 1.0).astype(z.dtype)
+        # Abreast: the evader straight to one side, both equally fast along the pursuer's axis.
+        axis = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+        along = jnp.sum(world.evader_velocity * axis) + z[0] / (4.0 * period)
+        along = jnp.clip(along, -speed, speed)
+        turning = jnp.clip(
+            (bearing_of(z) - left * jnp.pi / 2.0) / (4.0 * period),
+            -(speed - jnp.abs(along)) / axle,
+            (speed - jnp.abs(along)) / axle,
+        )
+        beside = wheels_from_body(along, turning, axle)
+        # Swinging in: the wheel away from the evader at full speed, the other at rest.
+        way = jnp.where(along < 0.0, -1.0, 1.0).astype(z.dtype)
+        right_wheel = (way * left > 0.0).astype(z.dtype)
+        swing = way * speed * jnp.stack([1.0 - right_wheel, right_wheel])
+        gap = norm(z) - scenario.capture_distance
+        # Elsewhere: to a place ahead of the evader, off its way by `lead`.
+        sine, cosine = jnp.sin(self.lead), jnp.cos(self.lead)
+        ahead = jnp.stack([cosine * onward[0] - sine * onward[1], sine * onward[0] + cosine * onward[1]])
+        station = world.evader + (scenario.capture_distance + _STAND_OFF) * ahead
+        end, turn = nearer_end(bearing_of(to_pursuer_frame(station, pose)))
+        approach = turn_and_drive(turn, end, speed, axle, period)
+        between = jnp.sum(_unit(pose[:2] - world.evader) * onward) > 0.2
+        near = between & (gap < 2.0 * _STAND_OFF)
+        gain = (speed * period) ** 2 / (8.0 * axle)
+        return jnp.where(near, jnp.where(gap < self.patience * gain, swing, beside), approach)
+
+
+def sideswiper(part: tuple[Float[Array, ""], Float[Array, ""]]) -> Sideswiper:
+    """The `Sideswiper` of (patience, lead)."""
+    return Sideswiper(*part)
+
+
+def _unit(offset: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     length = norm(offset)
     apart = length > 0.0
     return jnp.where(apart, offset / jnp.where(apart, length, 1.0), jnp.array([1.0, 0.0], offset.dtype))

@@ -10,11 +10,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from sidestep._arrays import real
 from sidestep.learning.td3 import TD3
-from sidestep.trials.falsification.attackers import Roster, bang_bang, built_in, herder, script
+from sidestep.trials.falsification.attackers import Roster, bang_bang, built_in, herder, script, sideswiper
 from sidestep.trials.falsification.chases import Chase, Target, run_from
 from sidestep.trials.falsification.cross_entropy import Search
 from sidestep.trials.falsification.learned import Lessons, lesson, new_pupil
@@ -115,8 +115,26 @@ class Herding(Attack):
         return None, _round(starts, *run_from(target, herder, parts, starts, self.periods, keys))
 
 
+@final
+class Sideswiping(Attack):
+    """Sideswipers of more and less patience, from ordinary starts and a quarter from the edge."""
+
+    chases: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, chase_key, patience_key, lead_key = jax.random.split(key, 4)
+        starts = _starts(target, start_key, self.chases, 0.25)
+        count = (self.chases,)
+        patience = jax.random.uniform(patience_key, count, dtype=float, minval=0.1, maxval=1.2)
+        lead = jax.random.uniform(lead_key, count, dtype=float, minval=-1.3, maxval=1.3)
+        keys = jax.random.split(chase_key, self.chases)
+        run_to_end = run_from(target, sideswiper, (patience, lead), starts, self.periods, keys)
+        return None, _round(starts, *run_to_end)
+
+
 @eqx.filter_jit
-def _bang_bang_plans(scenario: Any, keys: PRNGKeyArray, periods: int, longest: Array) -> Array:
+def _bang_bang_plans(scenario: Any, keys: Key[Array, "n"], periods: int, longest: Array) -> Array:
     return jax.vmap(lambda key: bang_bang(scenario, key, periods, longest))(keys)
 
 
@@ -179,7 +197,7 @@ class Learned(Attack):
         return state, _round(starts, chases, wheels)
 
 
-ATTACKS = ("pursuers", "bang-bang", "herder", "cross-entropy", "edge", "learned")
+ATTACKS = ("pursuers", "bang-bang", "herder", "sideswipe", "cross-entropy", "edge", "learned")
 """Every attack by name, in the order in which they take turns."""
 
 
@@ -196,6 +214,8 @@ def make_attack(name: str, batch: int = 256, periods: int = 1200) -> Attack:
         return Strategies(built_in(), batch, periods)
     if name == "herder":
         return Herding(batch, periods)
+    if name == "sideswipe":
+        return Sideswiping(batch, periods)
     if name == "bang-bang":
         return BangBang(batch, min(periods, 600))
     if name == "cross-entropy":

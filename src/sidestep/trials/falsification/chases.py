@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from sidestep._arrays import Count, real
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
@@ -98,7 +98,7 @@ def run(
     chases: Chase,
     begun: Count,
     periods: int,
-    keys: PRNGKeyArray,
+    keys: Key[Array, "n"],
 ) -> tuple[Chase, Float[Array, "chases t m 2"]]:
     """Each chase up to `periods` control periods further, or to its end.
 
@@ -141,7 +141,7 @@ def run_from(
     parts: Any,
     worlds: World,
     periods: int,
-    keys: PRNGKeyArray,
+    keys: Key[Array, "n"],
 ) -> tuple[Chase, Float[Array, "chases t m 2"]]:
     """`run` from given start worlds, compiled."""
     chases = jax.vmap(lambda world: begin(target, world))(worlds)

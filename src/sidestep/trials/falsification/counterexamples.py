@@ -88,7 +88,7 @@ def shield_name(shield: str | Shield, scenario: Scenario) -> str:
     if isinstance(shield, str):
         return shield
     for name, kind in SHIELDS.items():
-        if type(shield) is kind and eqx.tree_equal(shield, make_shield(name, scenario)) is True:
+        if type(shield) is kind and bool(eqx.tree_equal(shield, make_shield(name, scenario))):
             return name
     return CUSTOM
 

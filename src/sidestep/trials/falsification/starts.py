@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from sidestep._arrays import AnyArray, Flag, norm, real
 from sidestep.pursuit.steering import bearing_of
@@ -109,7 +109,9 @@ def freedom(scenario: Scenario, *, edge: bool) -> Float[np.ndarray, "n"]:
 
 
 def at_edge(scenario: Scenario, base: World, key: PRNGKeyArray) -> World:
-    """A start with a margin h of at most a millimetre towards every pursuer, three in four near its axis.
+    """A start with a margin h of at most a millimetre towards every pursuer.
+
+    Half of them lie near the pursuer's axis, a quarter straight to its side, the rest anywhere.
 
     All else is as in `base`, a start that the scenario drew, and everything is where the user fixed any
     start.
@@ -119,15 +121,16 @@ def at_edge(scenario: Scenario, base: World, key: PRNGKeyArray) -> World:
     m = scenario.pursuer_count
 
     def draw(key: PRNGKeyArray) -> World:
-        h_key, bearing_key, end_key, near_key = jax.random.split(key, 4)
+        h_key, bearing_key, end_key, place_key = jax.random.split(key, 4)
         vector = encode(scenario, base)
         h = jax.random.uniform(h_key, (m,), dtype=float, minval=LEAST_MARGIN, maxval=EDGE)
         anywhere = jax.random.uniform(bearing_key, (m,), dtype=float, minval=-jnp.pi, maxval=jnp.pi)
-        close = _NEAR_AXIS * anywhere / jnp.pi
-        close = jnp.where(jax.random.bernoulli(end_key, shape=(m,)), close, close + jnp.pi)
-        near = jax.random.bernoulli(near_key, 0.75, (m,))
+        where = jax.random.uniform(place_key, (m,), dtype=float)
+        middle = jnp.where(where < 0.5, 0.0, jnp.pi / 2.0)
+        middle = middle + jnp.where(jax.random.bernoulli(end_key, shape=(m,)), jnp.pi, 0.0)
+        bearing = jnp.where(where < 0.75, middle + _NEAR_AXIS / jnp.pi * anywhere, anywhere)
         places = 3 * jnp.arange(m)
-        vector = vector.at[places].set(h).at[places + 1].set(jnp.where(near, close, anywhere))
+        vector = vector.at[places].set(h).at[places + 1].set(bearing)
         return decode(scenario, base, vector)
 
     # Where the edge lies inside an obstacle, another draw; the scenario's own start if none will do.
@@ -138,7 +141,7 @@ def at_edge(scenario: Scenario, base: World, key: PRNGKeyArray) -> World:
 
 
 @eqx.filter_jit
-def draw_starts(scenario: Scenario, keys: PRNGKeyArray, edge: AnyArray) -> World:
+def draw_starts(scenario: Scenario, keys: Key[Array, "n"], edge: AnyArray) -> World:
     """One start a key, at the edge of the capture set where `edge` says so."""
 
     def draw(key: PRNGKeyArray, edge: Array) -> World:
