@@ -140,7 +140,7 @@ class Sideswiper(Pursuer):
         beside = wheels_from_body(along, turning, axle)
         # Swinging in: the wheel away from the evader at full speed, the other at rest.
         way = jnp.where(along < 0.0, -1.0, 1.0).astype(z.dtype)
-        right_wheel = (way * left > 0.0).astype(z.dtype)
+        right_wheel = (left > 0.0).astype(z.dtype)
         swing = way * speed * jnp.stack([1.0 - right_wheel, right_wheel])
         gap = norm(z) - scenario.capture_distance
         # Elsewhere: to a place ahead of the evader, off its way by `lead`.
