@@ -10,11 +10,11 @@ velocity being held in world axes in between; `control_step` is the rest and run
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import AnyArray, real
+from sidestep.pursuit import pursue
 from sidestep.world.events import Events
 from sidestep.world.observation import observe, to_velocity
 from sidestep.world.scenario import Scenario
@@ -57,25 +57,6 @@ def decide(scenario: Scenario, policy: Callable[..., Any], world: World) -> Floa
         )
     action = real(action)
     return jnp.where(jnp.all(jnp.isfinite(action)), to_velocity(scenario, world, action), jnp.nan)
-
-
-def pursue(
-    scenario: Scenario, pursuer: Callable[..., Any], world: World, key: PRNGKeyArray
-) -> Float[Array, "m 2"]:
-    """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
-
-    **Raises** `ValueError` when the strategy's answer does not have shape (2,).
-    """
-    keys = jax.random.split(key, scenario.pursuer_count)
-    answers = []
-    for index in range(scenario.pursuer_count):
-        wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
-        if wheels.shape != (2,):
-            raise ValueError(
-                f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
-            )
-        answers.append(real(wheels))
-    return jnp.stack(answers)
 
 
 def control_step(

@@ -2,6 +2,6 @@
 
 from sidestep.pursuit.foreign import as_pursuer
 from sidestep.pursuit.game import CaptureGame
-from sidestep.pursuit.pursuers import PURSUERS, Pursuer, make_pursuer
+from sidestep.pursuit.pursuers import PURSUERS, Pursuer, make_pursuer, pursue
 
-__all__ = ["PURSUERS", "CaptureGame", "Pursuer", "as_pursuer", "make_pursuer"]
+__all__ = ["PURSUERS", "CaptureGame", "Pursuer", "as_pursuer", "make_pursuer", "pursue"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from typing import final
+from collections.abc import Callable
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -195,3 +196,22 @@ def make_pursuer(name: str) -> Pursuer:
     if name not in PURSUERS:
         raise ValueError(f"unknown pursuer {name!r}; known pursuers: {', '.join(PURSUERS)}")
     return PURSUERS[name]()
+
+
+def pursue(
+    scenario: Scenario, pursuer: Callable[..., Any], world: World, key: PRNGKeyArray
+) -> Float[Array, "m 2"]:
+    """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
+
+    **Raises** `ValueError` when the strategy's answer does not have shape (2,).
+    """
+    keys = jax.random.split(key, scenario.pursuer_count)
+    answers = []
+    for index in range(scenario.pursuer_count):
+        wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
+        if wheels.shape != (2,):
+            raise ValueError(
+                f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
+            )
+        answers.append(real(wheels))
+    return jnp.stack(answers)
