@@ -8,6 +8,7 @@ import pytest
 
 from sidestep.learning.control_step import RUNNING
 from sidestep.learning.td3 import TD3
+from sidestep.pursuit import pursue
 from sidestep.safety import make_shield
 from sidestep.trials.falsification.attackers import (
     Herder,
@@ -56,6 +57,14 @@ def test_script_plays_its_rows_in_their_periods_and_keeps_the_last():
     for period, row in ((0, 0), (2, 0), (3, 1), (4, 2), (9, 2)):
         now = eqx.tree_at(lambda w: w.time, start, jnp.asarray(0.05 * period))
         assert np.allclose(pursuer(PAPER, now, key), plan[row, 0])
+
+
+def test_script_steers_each_of_several_pursuers_by_its_own_row():
+    plan = jnp.array([[[0.1, 0.1], [-0.05, 0.2]]])
+    start = World(jnp.zeros(2), jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), jnp.zeros((0, 4)), jnp.ones(2))
+    pair = load_scenario("paper", obstacle_count=0, pursuer_count=2)
+    wheels = pursue(pair, Script(plan, jnp.zeros((), jnp.int32)), start, jax.random.key(0))
+    assert np.allclose(wheels, plan[0])
 
 
 def test_bang_bang_wheels_are_always_full_and_dwell():

@@ -203,8 +203,13 @@ def pursue(
 ) -> Float[Array, "m 2"]:
     """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
 
+    A strategy with a method `steer_all(scenario, world) -> (m, 2)` is asked for all of them at once instead.
+
     **Raises** `ValueError` when the strategy's answer does not have shape (2,).
     """
+    together = getattr(pursuer, "steer_all", None)
+    if together is not None:
+        return limit_wheels(together(scenario, world), scenario.pursuer_speed)
     keys = jax.random.split(key, scenario.pursuer_count)
     answers = []
     for index in range(scenario.pursuer_count):
