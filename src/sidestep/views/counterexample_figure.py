@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
@@ -113,11 +114,12 @@ def _draw_scene(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: i
         marks = list(range(first + every, end + 1, every))
     draw_obstacles(axes, scenario, trajectory, end, [])
     draw_target(axes, scenario, np.asarray(worlds.target[0]))
-    draw_evader_path(axes, trajectory, Normalize(0.0, 2.0 * float(scenario.evader_speed)))
+    recent = jax.tree.map(lambda leaf: leaf[first:], trajectory)
+    draw_evader_path(axes, recent, Normalize(0.0, 2.0 * float(scenario.evader_speed)))
     size = 0.06 * float(np.ptp(axes.get_xlim()))
     for index in range(poses.shape[1]):
         draw_capture_set(axes, scenario, poses[end, index])
-        axes.plot(*poses[:, index, :2].T, color=PURSUER, linewidth=1.3, zorder=4)
+        axes.plot(*poses[first:, index, :2].T, color=PURSUER, linewidth=1.3, zorder=4)
         draw_pursuer(axes, poses[first, index], size=size, alpha=0.6)
         draw_pursuer(axes, poses[end, index], size=1.4 * size)
         draw_time_marks(axes, poses[:, index, :2], marks, length, PURSUER, dots=False, side=-1.0)

@@ -31,7 +31,7 @@ ASSUMPTIONS: dict[str, str] = {
 """What each shield's guarantee takes for granted, by the names that verdicts use."""
 
 _PURSUIT_SHIELDS = ("game", "joint")
-_ROUNDING = 64.0
+_ROUNDING = 8.0
 
 
 @dataclass(frozen=True)
