@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from sidestep._arrays import AnyArray, Flag, Scalar, real
 from sidestep.pursuit.game import CaptureGame, turning_moment
 from sidestep.world.capture_geometry import to_pursuer_frame
-from sidestep.world.robots import body_velocity
+from sidestep.world.robots import body_velocity, drive
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
@@ -204,7 +204,8 @@ class PursuitBarrier(Barrier):
       those of the period that has just ended, and a pursuer may turn them round at will: the row is then
       too weak by up to |n_x| |dv| + |sigma| |domega| <= 2 V max(|n_x|, |sigma|/b) and carries no worst-case
       guarantee. Wheel speeds are clipped to [-V, V]; a pursuer whose wheel speeds are not finite counts as
-      one of unknown motion.
+      one of unknown motion. The row speaks of an instant, and gives up what the first form has to spare
+      for the rest of a control period: to hold an action for a whole one, use `rows_over_period`.
 
     With h_max = l_max - l, alpha(h) = gamma min(h, h_max) + max(gamma, 1.5 (V/b) tan S) (h - h_max)+: the
     gain gamma as far as any gain will do (0 <= h <= h_max), and beyond it at least half again the slope that
@@ -259,6 +260,46 @@ class PursuitBarrier(Barrier):
         rate = speed * normal[0] - turn_rate * turning_moment(z, normal)
         # Rounding must not make the row ask for more than the worst case, which is known to be feasible.
         return jnp.where(known, jnp.minimum(rate, fastest), fastest)
+
+    def rows_over_period(self, scenario: Scenario, world: World, memory: Float[AnyArray, "m"]) -> BarrierRows:
+        """Two rows towards each pursuer, one after the other, for an action that is held for one period T.
+
+        The pursuers hold `world.wheel_speeds` meanwhile, and are at pose_t after t = T/2 and T. Followed on
+        one side h is convex in the evader's position, so that with n_t the normal seen from pose_t
+
+            h(p_e + t u; pose_t) >= h(p_e; pose_t) + t n_t.u.
+
+        The rows n_t.u >= (h(p_e; pose_0) - h(p_e; pose_t))/t - min(alpha(h), h/t) thus let h sink by no more
+        than t alpha(h), and not below 0, at those two times, exactly and without a margin for sampling. For
+        l <= l_max either is feasible from every h >= 0, since a pursuer alone lowers h no faster than at
+        v_e + alpha(h); both together are, but for rare turns in which the side to follow changes in between.
+        What is said of `known_velocity` holds here too: where the wheel speeds are not finite, both rows are
+        those of an unknown motion.
+        """
+        unknown = PursuitBarrier()
+
+        def towards(robot: Float[Array, "3"], wheels: Float[Array, "2"], side: Scalar) -> Any:
+            h, *worst = unknown.row(scenario, world.evader, robot, side)
+            known = jnp.all(jnp.isfinite(wheels)) & (scenario.pursuer_half_axle > 0.0)
+            axle = jnp.where(known, scenario.pursuer_half_axle, 1.0)
+            held = jnp.where(known, wheels, 0.0)
+            held = jnp.clip(held, -scenario.pursuer_speed, scenario.pursuer_speed)
+
+            def after(share: Scalar) -> tuple[Scalar, Float[Array, "2"], Scalar]:
+                time = share * scenario.control_period
+                pose = drive(robot, held, axle, time)
+                kept = unknown.recall(scenario, world.evader, pose, side)
+                normal, _ = unknown.approach(scenario, world.evader, pose, kept)
+                sunk = h - unknown.value(scenario, world.evader, pose, kept)
+                # However steep alpha is, one period must not spend more than there is.
+                allowed = jnp.minimum(self.allowance(scenario, h), jnp.abs(h) / time)
+                row = (normal, sunk / time - allowed)
+                return h, *jax.tree.map(lambda a, b: jnp.where(known, a, b), row, tuple(worst))
+
+            return jax.vmap(after)(real((0.5, 1.0)))
+
+        values, normals, offsets = jax.vmap(towards)(world.pursuers, world.wheel_speeds, real(memory))
+        return BarrierRows(values.reshape(-1), normals.reshape(-1, 2), offsets.reshape(-1))
 
     def allowance(self, scenario: Scenario, h: Any) -> Scalar:
         game = CaptureGame.of(scenario)
