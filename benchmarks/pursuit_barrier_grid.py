@@ -159,9 +159,9 @@ def solve(
     pursuer_knows: bool,
     levels: tuple[float, ...] = (),
     reach: float = REACH,
-    headings: int = 48,
+    headings: int = 24,
     arcs: int = 8,
-    longest: float = 40.0,
+    longest: float = 30.0,
     settled: float = 1e-4,
     progress: Callable[[float, float], None] | None = None,
 ) -> Solution:
@@ -373,7 +373,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pursuit_barrier_grid.json"))
     parser.add_argument("--cells", type=int, nargs="+", default=[48, 96, 192], help="per side")
-    parser.add_argument("--headings", type=int, default=48, help="among which the evader chooses")
+    parser.add_argument("--headings", type=int, default=24, help="among which the evader chooses")
     parser.add_argument("--figure", type=Path, help="also draw the paper's game")
     parser.add_argument("--figure-cells", type=int, default=192)
     arguments = parser.parse_args()
