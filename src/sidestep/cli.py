@@ -9,12 +9,13 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from sidestep.commands import evaluate, falsify, report, reproduce, train
+from sidestep.commands import certify, evaluate, falsify, report, reproduce, train
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
     evaluate.Evaluate: evaluate.run,
     reproduce.Reproduce: reproduce.run,
+    certify.Certify: certify.run,
     falsify.Falsify: falsify.run,
     report.Report: report.run,
 }
@@ -26,6 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
         Annotated[train.Train, subcommand("train")]
         | Annotated[evaluate.Evaluate, subcommand("evaluate")]
         | Annotated[reproduce.Reproduce, subcommand("reproduce")]
+        | Annotated[certify.Certify, subcommand("certify")]
         | Annotated[falsify.Falsify, subcommand("falsify")]
         | Annotated[report.Report, subcommand("report")],
         prog="sidestep",

@@ -1,6 +1,7 @@
 """What people see: figures and the report."""
 
 from sidestep.views.capture_figure import capture_figure
+from sidestep.views.certificate_figure import certificate_figure
 from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
@@ -12,6 +13,7 @@ __all__ = [
     "SCENE_FILE",
     "Run",
     "capture_figure",
+    "certificate_figure",
     "load_run",
     "outcome_figure",
     "reward_figure",

@@ -1,0 +1,252 @@
+"""The certificate: is the evader guaranteed never to be captured, from where, and how near does it get?
+
+For one pursuer in the unbounded plane that may react at any instant, and an evader that decides once per
+control period from measurements with bounded errors and age. The budget is
+
+    l' = l + position + b rho heading + delay + sampling + sides  <=  l_max,
+
+where `position` and `heading` are what the errors can hide of the barrier (it changes by at most 1 per metre
+and b rho per rad), `delay` is what the pursuer can gain unseen (v_e tau), `sampling` is delta(T) of
+`sampled_design`, and `sides` is what the same computation needs beyond these parts because an evader that
+measures with errors cannot always tell on which side of the pursuer's axis it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sidestep.safety.claims import Claim, claims_of
+from sidestep.safety.flow_map import seen_from, side_value
+from sidestep.safety.nearest_changes import Change, nearest_changes
+from sidestep.safety.sampled_design import best_design, broken_level, delay_cost, outruns, tightest_angle
+from sidestep.safety.sampled_game import Design, SampledGame
+from sidestep.safety.shield_check import ShieldLevel, shield_level
+from sidestep.safety.situation import Situation, plain, situation_of
+from sidestep.safety.survival import Survival, survival
+from sidestep.world.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is guaranteed. Lengths in m; an infinite length means that there is no limit.
+
+    - `guaranteed`: capture within the capture distance is impossible, for ever, from every start outside
+      `start_set`; `reason` says why, or why not
+    - `guaranteed_clearance`: the largest distance that can be guaranteed with these robots, errors and
+      period, whatever the capture distance; 0 where nothing is guaranteed
+    - `margin` = `guaranteed_clearance` - capture distance; negative: by how much the guarantee fails
+    - `budget`: parts of l' - l, their `total`, and `required` = l'
+    - `control_set`: what the certified law never lets the evader into (true positions), or None;
+      `start_set` the same grown by the measurement errors (measured positions)
+    - `start_margin`: signed distance of the asked start from `start_set`, or None
+    - `grid_error`: how much the computed clearance may still be below the true one (it is never above)
+    - `shield`: the level of the `game` shield, `survival` where the pursuer wins
+    """
+
+    situation: Situation
+    guaranteed: bool
+    reason: str
+    pursuer_wins: bool
+    guaranteed_clearance: float
+    largest_capture_distance: float
+    budget: dict[str, float]
+    grid_error: float
+    nearest_changes: tuple[Change, ...]
+    control_set: Design | None
+    start_set: Design | None
+    start: tuple[float, float] | None = None
+    start_margin: float | None = None
+    shield: ShieldLevel | None = None
+    survival: Survival | None = None
+    target_distance: float | None = None
+    claims: tuple[Claim, ...] = ()
+
+    @property
+    def margin(self) -> float:
+        """Guaranteed clearance less the capture distance, m."""
+        return self.guaranteed_clearance - self.situation.capture_distance
+
+    @property
+    def target(self) -> str | None:
+        """Whether the target is reached before capture: see `Survival.target`; None where not asked."""
+        if self.target_distance is None or self.survival is None:
+            return None
+        return self.survival.target(self.target_distance, self.situation.game.evader_speed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All figures as plain values; `sidestep certify --json` writes them, infinite ones as null."""
+        figures = asdict(self)
+        figures["situation"] = {**figures["situation"].pop("game"), **figures["situation"]}
+        figures |= {"margin": self.margin, "target": self.target}
+        figures["unlimited"] = math.isinf(self.guaranteed_clearance)
+        for name in ("control_set", "start_set"):
+            design = getattr(self, name)
+            if design is not None:
+                figures[name] = {"radius": design.level, "tip": design.tip, "angle": design.angle}
+        return figures
+
+
+def certify(
+    scenario: Scenario,
+    *,
+    position_error: float = 0.0,
+    heading_error: float = 0.0,
+    delay: float = 0.0,
+    own_motion_predicted: bool = True,
+    walls: bool = False,
+    start: tuple[float, float] | None = None,
+    target_distance: float | None = None,
+    half_axle: float | None = None,
+    control_period: float | None = None,
+    check_shield: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Certificate:
+    """What can be guaranteed for a scenario's robots.
+
+    **Arguments:** `position_error` (m) and `heading_error` (rad) bound every measurement of the pursuer,
+    `delay` (s) is its age; `own_motion_predicted`: the evader adds its own motion since. `walls`: the robots
+    are in a bounded arena. `start`: evader in the pursuer's frame (m). `target_distance` (m): asked of where
+    the pursuer wins. `half_axle` and `control_period`: instead of the scenario's; they may be 0 here.
+    `check_shield`: also compute what the shipped `game` shield keeps. `progress` is told what is computed.
+
+    **Raises** `ValueError` naming the argument, its value and what is allowed.
+    """
+    tell = progress or (lambda _: None)
+    numbers = {
+        "position_error": position_error, "heading_error": heading_error, "delay": delay,
+        "target_distance": target_distance, "half_axle": half_axle, "control_period": control_period,
+    }  # fmt: skip
+    for name, value in numbers.items():
+        if value is not None and not (math.isfinite(value) and value >= 0.0):
+            raise ValueError(f"{name} = {value!r}: it must be a finite number, 0 or more")
+    if heading_error >= math.pi / 2.0:
+        raise ValueError(f"heading_error = {heading_error!r}: it must be less than pi/2 rad")
+    if start is not None and (len(start) != 2 or not all(math.isfinite(value) for value in start)):
+        raise ValueError(f"start = {start!r}: it must be two finite numbers X,Y in the pursuer's frame")
+    situation = situation_of(scenario, half_axle, control_period, walls)
+    game = replace(
+        situation.game,
+        position_error=float(position_error),
+        heading_error=float(heading_error),
+        delay=float(delay),
+        own_motion_predicted=own_motion_predicted,
+    )
+    situation = replace(situation, game=game)
+    tell("what can be held at this period")
+    certificate = _answer(situation, tell)
+    if start is not None:
+        margin = None if certificate.control_set is None else start_margin(certificate, start)
+        certificate = replace(certificate, start=start, start_margin=margin)
+    if check_shield and game.half_axle > 0.0 and game.control_period > 0.0 and game.evader_speed > 0.0:
+        tell("what the game shield keeps")
+        certificate = replace(certificate, shield=shield_level(scenario))
+    if certificate.pursuer_wins or target_distance is not None:
+        tell("how long the evader lasts")
+        distance = plain(scenario.initial_separation)
+        lasts = survival(game, situation.capture_distance, start, distance)
+        certificate = replace(certificate, survival=lasts, target_distance=target_distance)
+    return replace(certificate, claims=claims_of(certificate))
+
+
+def _answer(situation: Situation, tell: Callable[[str], None]) -> Certificate:
+    game, wanted = situation.game, situation.capture_distance
+    limit = game.largest_capture_distance
+    exact = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
+    held = best_design(game)
+    sampled = held if exact == game else best_design(exact)
+    clearance = 0.0 if held is None else max(held.level - delay_cost(game), 0.0)
+    needed = wanted + delay_cost(game)
+    if outruns(game, needed):
+        clearance = math.inf
+    budget = _budget(game, wanted, clearance, 0.0 if sampled is None else sampled.level)
+    # The parts of the plain budget bound the clearance too, where they happen to be the stricter ones.
+    if math.isfinite(clearance) and math.isfinite(limit):
+        clearance = max(min(clearance, limit - budget["total"]), 0.0)
+    in_the_open = clearance >= wanted
+    alone = not situation.walls and situation.pursuer_count == 1
+    guaranteed = in_the_open and alone
+    changes: tuple[Change, ...] = ()
+    if not guaranteed:
+        tell("the nearest changes that make it hold")
+        changes = nearest_changes(situation, clearance)
+    control, start = _sets(game, needed if in_the_open else None, held) if alone else (None, None)
+    unsure = 0.0
+    if held is not None and math.isfinite(held.level):
+        tell("the grid's error")
+        unsure = max(broken_level(game, held) - held.level, 0.0)
+    return Certificate(
+        situation=situation,
+        guaranteed=guaranteed,
+        reason=_reason(situation, in_the_open),
+        pursuer_wins=wanted > limit,
+        guaranteed_clearance=clearance if alone else 0.0,
+        largest_capture_distance=limit,
+        budget=budget,
+        grid_error=unsure,
+        nearest_changes=changes,
+        control_set=control,
+        start_set=start,
+    )
+
+
+def _budget(game: SampledGame, wanted: float, clearance: float, sampled: float) -> dict[str, float]:
+    limit = game.largest_capture_distance
+    ratio = min(game.evader_speed / game.pursuer_speed, 1.0)
+    parts = {
+        "position": game.offset_error,
+        "heading": game.half_axle * ratio * game.heading_error,
+        "delay": delay_cost(game),
+        "sampling": limit - sampled if math.isfinite(limit) else 0.0,
+    }
+    used = sum(parts.values())
+    spent = limit - clearance if math.isfinite(limit) and math.isfinite(clearance) else used
+    parts["sides"] = max(spent - used, 0.0)
+    total = sum(parts.values())
+    return {**parts, "total": total, "required": wanted + total}
+
+
+def _sets(
+    game: SampledGame, needed: float | None, held: Design | None
+) -> tuple[Design | None, Design | None]:
+    """Control and start set: the smallest that protect the capture distance, or else the best there is."""
+    control = held if held is not None and math.isfinite(held.level) else None
+    if needed is not None:
+        angle = 0.0 if outruns(game, needed) else tightest_angle(game, needed)
+        control = control if angle is None else Design(angle, needed)
+    if control is None:
+        return None, None
+    turned = control.level * math.tan(control.angle) * game.heading_error
+    return control, Design(control.angle, control.level + game.offset_error + turned)
+
+
+def start_margin(certificate: Certificate, start: tuple[float, float]) -> float:
+    """How far (m) a measured start lies outside the set that the certified law keeps the evader out of.
+
+    The least over all true positions that the errors allow; 0 or more is a certified start.
+    """
+    game, control = certificate.situation.game, certificate.control_set
+    assert control is not None
+    point = np.asarray(start, float)
+    side = -1.0 if point[1] < 0.0 else 1.0
+    errors = np.array([-game.heading_error, 0.0, game.heading_error])
+    zero = np.zeros(3)
+    true = seen_from(np.broadcast_to(point, (3, 2)), np.stack([zero, zero, errors], -1))
+    return float(np.min(side_value(true, control.angle, side))) - game.offset_error - control.level
+
+
+def _reason(situation: Situation, in_the_open: bool) -> str:
+    limit = situation.game.largest_capture_distance
+    if situation.walls:
+        return "inside walls no evader is safe for ever, not even from a pursuer of its own speed"
+    if situation.pursuer_count > 1:
+        return f"no guarantee is known against {situation.pursuer_count} pursuers, only against one"
+    if in_the_open:
+        return "the evader can keep the capture distance for ever"
+    if situation.capture_distance > limit:
+        return f"the pursuer wins: the capture distance is more than l_max = {limit:.6g} m"
+    return "the evader would win with perfect information and no delay; the budget exceeds what is there"

@@ -1,0 +1,173 @@
+"""A certificate's sets in the pursuer's frame: what captures, what the budget adds, where it is safe."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
+
+from sidestep.safety.certificate import Certificate
+from sidestep.views.scene import draw_pursuer, set_limits
+from sidestep.views.style import (
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    PURSUER,
+    SKY,
+    WIDTH,
+    YELLOW,
+    house_style,
+    light_grid,
+    new_figure,
+    panel_titles,
+    save,
+)
+
+_PARTS = (
+    ("position", "+ position error", YELLOW),
+    ("heading", "+ heading error", ORANGE),
+    ("delay", "+ delay", PURPLE),
+    ("sampling", "+ sampling", SKY),
+    ("sides", "+ telling sides apart", GREY),
+)
+
+
+def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path, Path]:
+    """The capture set, the same grown by each part of the budget, and the safe set. Writes PNG and PDF.
+
+    a: all of it around the pursuer, with the usable part of the capture circle and the stand-off points
+    +-b cot S; b: the tip, where margins of millimetres can be seen. Returns the paths.
+    """
+    with house_style():
+        figure = new_figure(WIDTH, 4.4)
+        grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], height_ratios=[1.0, 0.36])
+        whole, tip = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+        key = figure.add_subplot(grid[1, :])
+        for axes in (whole, tip):
+            _draw_sets(axes, certificate)
+        _draw_pursuer_and_marks(whole, certificate)
+        _frame_whole(whole, certificate)
+        _frame_tip(tip, certificate)
+        key.set_axis_off()
+        handles, labels = whole.get_legend_handles_labels()
+        key.legend(handles, labels, loc="center", ncols=2, borderaxespad=0.0, labelspacing=0.4)
+        verdict = "guaranteed" if certificate.guaranteed else "not guaranteed"
+        titles = [f"Capture at {_wanted(certificate):g} m: {verdict}", "The tip ahead"]
+        panel_titles([whole, tip], titles)
+        return save(figure, path)
+
+
+def _wanted(certificate: Certificate) -> float:
+    return certificate.situation.capture_distance
+
+
+def set_outline(radius: float, angle: float, points: int = 181) -> Float[np.ndarray, "n 2"]:
+    """Outline (m, closed) of a disc with tips whose sides have normals `angle` (rad) from the axis."""
+    left = np.linspace(angle, np.pi - angle, points)
+    arc = radius * np.stack([np.cos(left), np.sin(left)], -1)
+    apex = np.array([[radius / math.cos(angle), 0.0]])
+    return np.concatenate([apex, arc, -apex, -arc, apex])
+
+
+def _grown(certificate: Certificate) -> list[tuple[str, str, float]]:
+    """Label, colour and radius of every budget part that is not 0, from the capture distance outward."""
+    radius, sets = _wanted(certificate), []
+    for name, label, colour in _PARTS:
+        part = certificate.budget[name]
+        if part > 0.0:
+            radius += part
+            sets.append((f"{label} {1e3 * part:.3g} mm", colour, radius))
+    return sets
+
+
+def _draw_sets(axes: Axes, certificate: Certificate) -> None:
+    angle = certificate.situation.game.usable_angle
+    axes.set_facecolor("#EAF5F0")
+    light_grid(axes)
+    grown = _grown(certificate)
+    for label, colour, radius in reversed(grown):
+        outline = set_outline(radius, angle)
+        axes.add_patch(Polygon(outline, facecolor=colour, edgecolor="white", linewidth=0.4, label=label))
+    held = _wanted(certificate)
+    fill = Polygon(
+        set_outline(held, angle), facecolor="#F3C9B5", edgecolor=PURSUER, linewidth=1.2,
+        label=f"capture set K(l), l = {held:g} m",
+    )  # fmt: skip
+    axes.add_patch(fill)
+    limit = certificate.largest_capture_distance
+    if math.isfinite(limit) and 0.0 < limit < 3.0 * held:
+        axes.plot(
+            *set_outline(limit, angle).T, color=INK, linewidth=1.0, linestyle=(0, (4, 2)),
+            label=f"K(l_max), l_max = {limit:.5g} m: the most there is",
+        )  # fmt: skip
+    control = certificate.control_set
+    if control is not None and (certificate.guaranteed or control.level != held):
+        words = "is kept out of this set" if certificate.guaranteed else "can be kept out of this set only"
+        axes.plot(
+            *set_outline(control.level, control.angle).T, color=GREEN, linewidth=1.4,
+            label=f"the evader {words}, {control.level:.5g} m",
+        )  # fmt: skip
+
+
+def _draw_pursuer_and_marks(axes: Axes, certificate: Certificate) -> None:
+    game, held = certificate.situation.game, _wanted(certificate)
+    angle = game.usable_angle
+    if angle > 0.0:
+        arc = np.linspace(-angle, angle, 61)
+        for end in (1.0, -1.0):
+            axes.plot(
+                end * held * np.cos(arc), held * np.sin(arc), color=PURSUER, linewidth=2.6, zorder=4,
+                label="usable part" if end > 0 else None,
+            )  # fmt: skip
+        stand_off = game.half_axle / math.tan(angle)
+        axes.plot(
+            [stand_off, -stand_off], [0.0, 0.0], "D", color=INK, markersize=4, linestyle="none", zorder=6,
+            label=f"stand-off b cot S, {stand_off:.4g} m",
+        )  # fmt: skip
+    draw_pursuer(axes, np.zeros(3), size=0.5 * held)
+    if certificate.start is not None:
+        axes.plot(*certificate.start, "o", color=GREEN, markersize=5, zorder=7, label="start asked about")
+
+
+def _outside(certificate: Certificate) -> str:
+    if certificate.guaranteed:
+        return "safe for ever"
+    kept = certificate.guaranteed_clearance
+    return f"{kept:.4g} m is kept for ever" if kept > 0.0 else "nothing is guaranteed"
+
+
+def _frame_whole(axes: Axes, certificate: Certificate) -> None:
+    angle = certificate.situation.game.usable_angle
+    largest = max([_wanted(certificate), *(radius for _, _, radius in _grown(certificate))])
+    points = set_outline(largest, angle)
+    if certificate.start is not None and np.hypot(*certificate.start) < 4.0 * largest:
+        points = np.concatenate([points, [certificate.start]])
+    set_limits(axes, points, 0.08)
+    axes.text(0.02, 0.97, _outside(certificate), transform=axes.transAxes, color=GREEN, va="top", fontsize=8)
+    axes.set_xlabel("ahead of the pursuer, m")
+    axes.set_ylabel("left of it, m")
+
+
+def _frame_tip(axes: Axes, certificate: Certificate) -> None:
+    angle = certificate.situation.game.usable_angle
+    radii = [_wanted(certificate), *(radius for _, _, radius in _grown(certificate))]
+    tips = [radius / math.cos(angle) for radius in radii]
+    if certificate.control_set is not None:
+        tips.append(certificate.control_set.tip)
+    limit = certificate.largest_capture_distance
+    if math.isfinite(limit) and limit < 1.5 * max(radii):
+        tips.append(limit / math.cos(angle))
+    low, high = min(tips), max(tips)
+    span = max(high - low, 0.01 * _wanted(certificate))
+    axes.set_xlim(low - 1.3 * span, high + 0.7 * span)
+    half = 0.5 * (high - low + 2.0 * span)
+    axes.set_ylim(-half, half)
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlabel("ahead of the pursuer, m")
+    axes.locator_params(axis="x", nbins=4)
