@@ -261,8 +261,9 @@ def compare(case: tuple[float, float, float, float], bounds: tuple[Solution, Sol
     level = bounds[0].levels.index(size / half_axle)
     early, late = (one.arrivals[level].reshape(-1) * half_axle / case[1] for one in bounds)
     arrivals = dict(zip(ways, (early, late, (early + late) / 2.0), strict=True))
-    # Farther out the edge of the grid could have had a say.
-    inner = (times > 0.0) & np.isfinite(times) & (np.hypot(*nodes.T) <= 0.5 * nodes.max())
+    # Farther out the edge of the grid could have had a say, and at contact rounding decides.
+    distance = np.hypot(*nodes.T)
+    inner = (distance > (1.0 + 1e-6) * size) & np.isfinite(times) & (distance <= 0.5 * nodes.max())
     for way, grid_h in ways.items():
         disputed = (grid_h <= 0.0) != np.isfinite(times)
         error = grid_h - np.minimum(h, spare)
@@ -331,7 +332,7 @@ def draw(path: Path, cells: int, headings: int) -> None:
     import jax.numpy as jnp
 
     from sidestep.pursuit import CaptureGame
-    from sidestep.views.style import BLUE, GREY, VERMILION, WIDTH, house_style, new_figure, save
+    from sidestep.views.style import BLACK, SKY, VERMILION, WIDTH, house_style, new_figure, panel_titles, save
 
     case = CASES["paper"]
     game, half_axle = CaptureGame(*case), case[2]
@@ -344,26 +345,24 @@ def draw(path: Path, cells: int, headings: int) -> None:
     with house_style():
         figure = new_figure(WIDTH, 0.42 * WIDTH)
         left, right = figure.subplots(1, 2)
-        for values, colour, style, label in (
-            (exact, BLUE, "-", "barrier"),
-            (half_axle * low.values, VERMILION, "--", "grid, the pursuer knows"),
-            (half_axle * high.values, GREY, "--", "grid, the evader knows"),
+        for values, label, look in (
+            (exact, "barrier", {"colors": SKY, "linestyles": "-", "linewidths": 3.0}),
+            (half_axle * low.values, "grid, the pursuer knows", {"colors": VERMILION, "linestyles": "--"}),
+            (half_axle * high.values, "grid, the evader knows", {"colors": BLACK, "linestyles": ":"}),
         ):
-            lines = left.contour(*np.moveaxis(nodes, -1, 0), values, levels, colors=colour, linestyles=style)
-            if style == "-":
-                left.clabel(lines, fmt=lambda level: f"{level:g} m", fontsize=7)
-            left.plot([], [], color=colour, linestyle=style, label=label)
-            ahead = nodes[:, 0, 0]
-            right.plot(ahead, values[:, 0], color=colour, linestyle=style, label=label)
-        left.set(xlim=(0, 0.32), ylim=(0, 0.22), aspect="equal")
+            left.contour(*np.moveaxis(nodes, -1, 0), values, levels, **look)
+            line = {name.removesuffix("s"): value for name, value in look.items()}
+            right.plot(nodes[:, 0, 0], values[:, 0], label=label, **line)
+        left.set(xlim=(0, 0.32), ylim=(0, 0.22), aspect="equal", yticks=[0.0, *levels])
         left.set(xlabel="ahead of the pursuer (m)", ylabel="to its left (m)")
-        left.set_title("a   smallest distance that can be forced")
-        right.axhline(largest, color="#777777", linewidth=0.6)
-        right.annotate("largest capture distance", (0.33, largest), (0, 3), textcoords="offset points")
-        right.set(xlim=(0, 0.6), ylim=(0, 0.24))
-        right.set(xlabel="ahead of the pursuer, on its axis (m)", ylabel="smallest distance (m)")
-        right.set_title("b   on the axis")
+        right.set(xlim=(0, 0.6), ylim=(0, 0.24), xlabel="ahead of the pursuer, on its axis (m)")
+        right.set_ylabel("smallest distance (m)")
+        right.annotate(
+            f"largest: {largest:.4f} m", (0.6, largest), (0, -12), ha="right",
+            textcoords="offset points",
+        )  # fmt: skip
         right.legend(loc="lower right")
+        panel_titles([left, right], ["Lines of equal smallest distance", "The same on the axis"])
         save(figure, path)
 
 
@@ -372,10 +371,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pursuit_barrier_grid.json"))
-    parser.add_argument("--cells", type=int, nargs="+", default=[48, 96, 192], help="per side")
+    parser.add_argument("--cells", type=int, nargs="+", default=[48, 96, 144], help="per side")
     parser.add_argument("--headings", type=int, default=24, help="among which the evader chooses")
     parser.add_argument("--figure", type=Path, help="also draw the paper's game")
-    parser.add_argument("--figure-cells", type=int, default=192)
+    parser.add_argument("--figure-cells", type=int, default=96)
     arguments = parser.parse_args()
 
     settings = {"reach": REACH, "step_cells": STEP_CELLS, "headings": arguments.headings}
