@@ -1,7 +1,5 @@
 """The worst case behind the certificate: no real motion beats it, and little less would be beaten."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,35 +9,23 @@ from sidestep.pursuit import CaptureGame
 from sidestep.safety.flow_map import (
     advance,
     closest_alignment,
-    seen_from,
     side_value,
     turn_drive_turn,
     wheel_motions,
 )
+from sidestep.safety.greedy_chase import chase, random_wheels
 from sidestep.safety.sampled_design import COARSE, FINE, best_design, broken_level, holds
-from sidestep.safety.sampled_game import Cells, Design, SampledGame, found_slack, overlap, slack
+from sidestep.safety.sampled_game import Cells, Design, SampledGame, found_slack, slack
 from sidestep.world.robots import drive
 
 PAPER = {"evader_speed": 0.1574, "pursuer_speed": 0.2, "half_axle": 0.2}
-
-
-def _wheels(rng, count, segments, rim, *, extreme):
-    """Random admissible wheel speeds in segments that fill one unit of time."""
-    speeds = (
-        rng.choice([-1.0, 1.0], (count, segments, 2)) if extreme else rng.uniform(-1, 1, (count, segments, 2))
-    )
-    cuts = np.sort(rng.random((count, segments - 1)), axis=1)
-    # Short first turns matter most, so some cuts come early.
-    cuts[::3] = np.sort(cuts[::3] ** 4, axis=1)
-    edges = np.concatenate([np.zeros((count, 1)), cuts, np.ones((count, 1))], axis=1)
-    return rim * speeds, np.diff(edges, axis=1)
 
 
 @pytest.mark.parametrize("half_axle, time", [(0.2, 0.05), (0.2, 3.0), (0.05, 1.0)])
 def test_no_motion_of_the_pursuer_comes_farther_than_the_bound(half_axle, time):
     rng = np.random.default_rng(0)
     for extreme in (True, False):
-        wheels, share = _wheels(rng, 20_000, 4, 0.2, extreme=extreme)
+        wheels, share = random_wheels(rng, 20_000, 4, 0.2, extreme=extreme)
         poses = wheel_motions(wheels, time * share, half_axle)
         turned = np.sum(0.5 * np.abs(wheels[..., 1] - wheels[..., 0]) * time * share, axis=1) / half_axle
         assert np.all(np.abs(poses[:, 2]) <= turned + 1e-12)
@@ -66,7 +52,7 @@ def test_the_bound_is_attained_by_turning_and_driving():
 
 def test_motions_are_those_of_the_simulated_pursuer(x64):
     rng = np.random.default_rng(1)
-    wheels, share = _wheels(rng, 20, 3, 0.2, extreme=False)
+    wheels, share = random_wheels(rng, 20, 3, 0.2, extreme=False)
     for speeds, times, pose in zip(wheels, share, wheel_motions(wheels, share, 0.2), strict=True):
         simulated = jnp.zeros(3)
         for speed, time in zip(speeds, times, strict=True):
@@ -98,84 +84,20 @@ def designs():
     return {game: best_design(game, COARSE) for game in GAMES.values()}
 
 
-def _law(game, design, measured, side):
-    """Where the certified law flees: along the normal of the side that the measurement leaves in no doubt."""
-    constant, growth = overlap(game, design.angle)
-    past = constant + growth * design.level
-    side = np.where(side * measured[:, 1] < -past / 2.0, -side, side)
-    if past == 0.0:
-        side = np.where(measured[:, 1] < 0.0, -1.0, 1.0)
-    bearing = np.arctan2(side * measured[:, 1], np.abs(measured[:, 0]))
-    bearing = np.clip(bearing, design.angle, np.pi / 2.0)
-    ahead = np.where(measured[:, 0] < 0.0, -1.0, 1.0) * np.cos(bearing)
-    return game.evader_speed * np.stack([ahead, side * np.sin(bearing)], -1), side
-
-
-def _near_the_boundary(rng, design, count, past):
-    """Starts on the left, most near the tip and some past the axis, which is where the pursuer gains."""
-    sine, cosine = math.sin(design.angle), math.cos(design.angle)
-    share = np.where(rng.random(count) < 0.7, 1.0 - 0.05 * rng.random(count), rng.random(count))
-    along = design.level * math.tan(design.angle) * share
-    along += np.where(rng.random(count) < 0.3, past / cosine * rng.random(count), 0.0) * (share > 0.95)
-    point = design.level * np.array([cosine, sine]) + along[:, None] * np.array([sine, -cosine])
-    # Some are a little farther away: the set has to hold from there too.
-    return point * (1.0 + 0.01 * rng.random((count, 1)) * (rng.random((count, 1)) < 0.3))
-
-
-def _chase(game, design, seed, steps, segments, count=60, choices=80):
-    """Least value less the level, and least distance at any instant, of games against greedy pursuers.
-
-    Within each period each pursuer takes the worst of many random bang-bang motions of several segments.
-    """
-    rng = np.random.default_rng(seed)
-    constant, growth = overlap(game, design.angle)
-    past = constant + growth * design.level
-    z, side = _near_the_boundary(rng, design, count, past), np.ones(count)
-    least, nearest = np.inf, np.inf
-    for _ in range(steps):
-        turn = game.heading_error * rng.choice([-1.0, 0.0, 1.0], count)
-        zeros = np.zeros(count)
-        error = rng.normal(size=(count, 2))
-        error *= game.position_error / np.linalg.norm(error, axis=1, keepdims=True)
-        error[::2] = np.stack([zeros, -side * game.position_error], -1)[::2]
-        measured = seen_from(z, np.stack([zeros, zeros, turn], -1)) + error
-        velocity, side = _law(game, design, measured, side)
-        velocity = seen_from(velocity, np.stack([zeros, zeros, -turn], -1))
-        wheels, share = _wheels(rng, choices, segments, game.pursuer_speed, extreme=True)
-        poses = wheel_motions(wheels, game.control_period * share, game.half_axle)
-        after = seen_from((z + velocity * game.control_period)[:, None], poses[None])
-        here = side_value(after, design.angle, side[:, None])
-        there = side_value(after, design.angle, -side[:, None])
-        value = np.where(side[:, None] * after[..., 1] >= -past, here, there)
-        worst = np.argmin(value, axis=1)
-        for part in (0.25, 0.5, 0.75, 1.0):
-            begun = np.cumsum(share, axis=1) - share
-            times = game.control_period * np.clip(part - begun, 0.0, share)
-            where = wheel_motions(wheels, times, game.half_axle)[worst]
-            moved = z + velocity * game.control_period * part
-            nearest = min(nearest, float(np.min(np.hypot(*(moved - where[:, :2]).T))))
-        rows = np.arange(count)
-        z = after[rows, worst]
-        least = min(least, float(np.min(value[rows, worst])) - design.level)
-        away = value[rows, worst] > design.level + 0.5 * game.pursuer_speed * game.control_period
-        z[away], side[away] = _near_the_boundary(rng, design, int(np.sum(away)), past), 1.0
-    return least, nearest
-
-
 @every_game
 @pytest.mark.parametrize("segments", [2, 3, 5])
 def test_greedy_pursuers_never_break_the_certified_level(designs, game, segments):
     design = designs[game]
-    least, nearest = _chase(game, design, seed=segments, steps=60, segments=segments)
-    assert least >= 0.0
-    assert nearest >= design.level
+    played = chase(game, design, seed=segments, periods=60, segments=segments)
+    assert played.least_value >= design.level
+    assert played.least_distance >= design.level
 
 
 @pytest.mark.parametrize("name", ["20 Hz", "2 Hz", "errors"])
 def test_greedy_pursuers_do_break_a_higher_level(designs, name):
     game = GAMES[name]
     higher = Design(game.usable_angle, 1.02 * designs[game].level)
-    assert _chase(game, higher, seed=0, steps=60, segments=2)[0] < 0.0
+    assert chase(game, higher, seed=0, periods=60, segments=2).least_value < higher.level
 
 
 @every_game
