@@ -229,3 +229,23 @@ def test_replay_from_the_command_line_shows_what_happened(found, tmp_path, capsy
     (tmp_path / "bad.npz").write_bytes(path.read_bytes()[:-100])
     assert main(["falsify", "--replay", str(tmp_path / "bad.npz")]) == 2
     assert "damaged" in capsys.readouterr().err
+
+
+def test_search_from_the_command_line_reports_what_it_found(tmp_path, capsys):
+    out, figures = tmp_path / "out", tmp_path / "figures.json"
+    small = ["--batch", "32", "--seconds", "10", "--episodes", "32", "--most", "1"]
+    asked = ["falsify", "--shield", "paper", "--attacks", "bang-bang", "--goal", "capture"]
+    asked += ["--set", "obstacle_count=0", "--out", str(out), "--json", str(figures), *small]
+    assert main(asked) == 0
+    told = capsys.readouterr().out
+    assert "bang-bang" in told
+    assert "sidestep falsify --replay" in told
+    summary = json.loads(figures.read_text())
+    assert summary["episodes"] == 32
+    assert summary["captured"] >= summary["kept"] >= 1
+    for entry in summary["counterexamples"]:
+        name = entry["file"].removeprefix("counterexamples/").removesuffix(".npz")
+        assert (out / "figures" / f"{name}.png").stat().st_size > 10_000
+    assert main([*asked, "--goal", "fame"]) == 2
+    assert main(asked) == 2
+    assert "--resume" in capsys.readouterr().err

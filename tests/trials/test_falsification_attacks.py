@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sidestep.learning.control_step import RUNNING
-from sidestep.learning.td3 import TD3
 from sidestep.pursuit import pursue
 from sidestep.safety import make_shield
 from sidestep.trials.falsification.attackers import (
@@ -22,7 +21,6 @@ from sidestep.trials.falsification.attacks import ATTACKS, make_attack
 from sidestep.trials.falsification.chases import Target, begin, run, shortfall
 from sidestep.trials.falsification.counterexamples import play
 from sidestep.trials.falsification.cross_entropy import Search, minimise
-from sidestep.trials.falsification.learned import OBSERVATIONS, Lessons, lesson, look, new_pupil
 from sidestep.trials.falsification.planned import Planning, chase_with_plans, search_starts
 from sidestep.trials.falsification.starts import (
     EDGE,
@@ -195,42 +193,6 @@ def test_goal_decides_what_counts_as_near():
     )
     for goal, nearer in (("capture", 0), ("collision", 1), ("both", 0)):
         assert int(np.argmin(shortfall(goal, chases))) == nearer
-
-
-def test_learning_pursuer_learns_from_every_period_that_counts():
-    algorithm = TD3(hidden=(8, 8))
-    lessons = Lessons(
-        algorithm, chases=4, decisions=6, decision_steps=2, updates=2, batch_size=8, capacity=50
-    )
-    pupil = new_pupil(lessons, jax.random.key(0))
-    starts = draw_starts(EMPTY, jax.random.split(jax.random.key(1), 4), np.array([True, True, False, False]))
-    taught, chases, wheels = lesson(UNSHIELDED, lessons, pupil, starts, "capture", jax.random.key(2))
-    steps = np.asarray(chases.steps)
-    assert wheels.shape == (4, 12, 1, 2)
-    assert int(taught.ring.written) == np.sum(-(-steps // 2))
-    assert int(taught.learner.updates) > 0
-    filled = int(min(taught.ring.written, 50))
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:filled], taught.ring.rows)
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(rows))
-    # Only a loss pays the bonus, and it ends the episode.
-    assert np.sum(rows.reward > 5.0) == np.sum(np.asarray(chases.outcome) == 0)
-    assert np.sum(rows.terminated) == np.sum(np.asarray(chases.outcome) != RUNNING)
-    assert np.all(np.asarray(wheels)[np.arange(12) >= steps[:, None]] == 0.0)
-
-
-def test_pursuer_sees_the_same_in_a_turned_world():
-    start = PAPER.reset(jax.random.key(4))
-    turn = jnp.array([[0.0, -1.0], [1.0, 0.0]])
-    turned = World(
-        evader=turn @ start.evader,
-        pursuers=jnp.concatenate([start.pursuers[:, :2] @ turn.T, start.pursuers[:, 2:] + jnp.pi / 2], -1),
-        obstacles=jnp.concatenate([start.obstacles[:, :2] @ turn.T, start.obstacles[:, 2:] @ turn.T], -1),
-        target=turn @ start.target,
-    )
-    seen = look(PAPER, start)
-    assert seen.shape == (OBSERVATIONS,)
-    assert np.allclose(seen, look(PAPER, turned), atol=1e-5)
-    assert np.max(np.abs(seen)) <= 1.0 + 1e-6
 
 
 def test_every_attack_can_be_made_and_others_are_refused():

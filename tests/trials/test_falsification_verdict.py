@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.safety import Status
-from sidestep.trials.falsification import ASSUMPTIONS, judge
+from sidestep.trials.falsification import ASSUMPTIONS, certified_clearance, judge
 from sidestep.world import Scenario
 
 PAPER = Scenario()
@@ -53,6 +53,19 @@ def test_certificate_decides_how_deep_sampling_may_go(chase):
         verdict = judge(PAPER, "game", lost, guaranteed_clearance=guaranteed)
         assert verdict.inside
         assert verdict.assumption is None
+
+
+def test_what_a_shield_keeps_is_computed_only_where_it_promises_something():
+    for scenario, shield in (
+        (PAPER, "paper"),
+        (PAPER, "none"),
+        (Scenario(pursuer_count=2), "game"),
+        (Scenario(pursuer_half_axle=0.1), "game"),
+    ):
+        assert certified_clearance(scenario, shield) is None
+    kept = certified_clearance(PAPER, "game")
+    # A swing from beside gains V^2 T^2/(8 b) = 0.06 mm, so no less can be promised away.
+    assert -0.2 <= kept < -6e-5
 
 
 def test_capture_at_a_control_period_short_enough_is_inside_the_assumptions(chase):

@@ -11,7 +11,6 @@ import tyro
 from sidestep.commands.common import (
     CountBar,
     Overrides,
-    ScenarioName,
     ShieldName,
     parse_overrides,
     write_json_file,
@@ -33,8 +32,8 @@ class Falsify:
     """Run folder whose policy steers the evader, or goal-seeking for the untrained one."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder to write, never overwritten silently; runs/falsify-SHIELD by default."""
-    scenario: ScenarioName = "paper"
-    """Preset (paper, paper-test) or a TOML or JSON file."""
+    scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Preset (paper, paper-test) or a TOML or JSON file; the policy's own scenario, or paper, by default."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=0."""
     goal: str = "both"
@@ -65,21 +64,28 @@ def run(command: Falsify, console: Console) -> int:
     """Run `sidestep falsify`; returns the exit status."""
     if command.replay is not None:
         return _replay(command, console)
-    from sidestep.trials.falsification import ATTACKS, Plan, falsify
+    from sidestep.learning.records import open_run
+    from sidestep.trials.falsification import ATTACKS, Plan, certified_clearance, falsify
     from sidestep.world import load_scenario
 
     out = command.out or Path("runs") / f"falsify-{command.shield}"
-    plan = Plan(
-        seed=command.seed,
-        goal=command.goal,
-        attacks=command.attacks or ATTACKS,
-        batch=command.batch,
-        seconds=command.seconds,
-        most=command.most,
-    )
+    overrides = parse_overrides(command.set)
+    if command.scenario is None and (Path(command.policy) / "config.json").is_file():
+        scenario = load_scenario("paper", **{**open_run(command.policy)["scenario"], **overrides})
+    else:
+        scenario = load_scenario(command.scenario or "paper", **overrides)
     with SearchBar(console) as show:
+        plan = Plan(
+            guaranteed_clearance=None if command.resume else certified_clearance(scenario, command.shield),
+            seed=command.seed,
+            goal=command.goal,
+            attacks=command.attacks or ATTACKS,
+            batch=command.batch,
+            seconds=command.seconds,
+            most=command.most,
+        )
         found = falsify(
-            load_scenario(command.scenario, **parse_overrides(command.set)),
+            scenario,
             command.policy,
             command.shield,
             out=out,

@@ -10,8 +10,9 @@ from sidestep.trials.falsification.counterexamples import (
     replay,
     write_counterexample,
 )
-from sidestep.trials.falsification.search import Falsification, Plan, Progress, falsify
-from sidestep.trials.falsification.verdict import ASSUMPTIONS, Verdict, judge
+from sidestep.trials.falsification.search import falsify
+from sidestep.trials.falsification.tallies import Falsification, Plan, Progress
+from sidestep.trials.falsification.verdict import ASSUMPTIONS, Verdict, certified_clearance, judge
 
 __all__ = [
     "ASSUMPTIONS",
@@ -24,6 +25,7 @@ __all__ = [
     "Progress",
     "Replay",
     "Verdict",
+    "certified_clearance",
     "falsify",
     "judge",
     "read_counterexample",

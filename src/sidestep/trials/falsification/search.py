@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,15 @@ from sidestep.trials.falsification.counterexamples import (
     shield_name,
     write_counterexample,
 )
+from sidestep.trials.falsification.tallies import (
+    COUNTERS,
+    LEAST,
+    Falsification,
+    Plan,
+    Progress,
+    Tally,
+    clearance_of,
+)
 from sidestep.trials.falsification.verdict import judge
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
@@ -44,102 +52,6 @@ _WANTED = {"capture": ("captured",), "collision": ("collided",), "both": ("captu
 _EXAMINED = 16
 _DEEPER = 1e-4
 _DEFAULT_MINUTES = 3.0
-_COUNTERS = ("rounds", "episodes", "control_periods", "seconds", "captured", "collided", "unconfirmed")
-_LEAST = ("pursuer_clearance", "obstacle_clearance", "margin")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is searched for, and how: everything that a resumed search must not change.
-
-    `batch` chases or plans at once; `seconds` the longest chase; `most` counterexamples kept per attack and
-    outcome (more only if they get 0.1 mm deeper, or broke no assumption).
-    """
-
-    seed: int = 0
-    goal: str = "both"
-    attacks: tuple[str, ...] = ATTACKS
-    batch: int = 256
-    seconds: float = 60.0
-    most: int = 5
-    guaranteed_clearance: float | None = None
-
-
-@dataclass
-class Tally:
-    """What one attack has come to. Clearances and margin: the least, m. `first` s into the search."""
-
-    rounds: int = 0
-    episodes: int = 0
-    control_periods: int = 0
-    seconds: float = 0.0
-    captured: int = 0
-    collided: int = 0
-    unconfirmed: int = 0
-    pursuer_clearance: float = np.inf
-    obstacle_clearance: float = np.inf
-    margin: float = np.inf
-    first: float | None = None
-    kept: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, line: Mapping[str, Any]) -> None:
-        """Count one round, as its line in `metrics.jsonl` says."""
-        for name in _COUNTERS:
-            setattr(self, name, getattr(self, name) + (1 if name == "rounds" else line[name]))
-        for name in _LEAST:
-            value = line[name]
-            setattr(self, name, min(getattr(self, name), np.inf if value is None else value))
-        self.kept += line["counterexamples"]
-        if self.first is None and line["counterexamples"]:
-            self.first = line["at"]
-
-    def deepest(self, outcome: str) -> tuple[int, float]:
-        """How many counterexamples with this outcome are kept, and the least clearance among them."""
-        name = _clearance_of(outcome)
-        depths = [entry[name] for entry in self.kept if entry["outcome"] == outcome]
-        return len(depths), min(depths, default=np.inf)
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where the search is: the attack that has just played a round, its tally, and all of them."""
-
-    attack: str
-    tally: Tally
-    tallies: Mapping[str, Tally]
-    seconds: float
-    budget: float | None
-
-    @property
-    def counterexamples(self) -> int:
-        """Counterexamples kept so far."""
-        return sum(len(tally.kept) for tally in self.tallies.values())
-
-
-@dataclass(frozen=True)
-class Falsification:
-    """A search and what it found. `folder/counterexamples` holds one file per counterexample kept."""
-
-    folder: Path
-    summary: Mapping[str, Any]
-    tallies: Mapping[str, Tally]
-    interrupted: bool
-
-    @property
-    def counterexamples(self) -> list[Path]:
-        """Files of the counterexamples kept, in the order in which they were found."""
-        entries = [entry for tally in self.tallies.values() for entry in tally.kept]
-        return [self.folder / entry["file"] for entry in sorted(entries, key=lambda entry: entry["at"])]
-
-    @property
-    def inside(self) -> list[Path]:
-        """Files of those that broke no assumption."""
-        entries = [entry for tally in self.tallies.values() for entry in tally.kept]
-        return [self.folder / entry["file"] for entry in entries if entry["assumption"] is None]
-
-
-def _clearance_of(outcome: str) -> str:
-    return "pursuer_clearance" if outcome == "captured" else "obstacle_clearance"
 
 
 def check_plan(scenario: Scenario, plan: Plan) -> None:
@@ -201,8 +113,6 @@ def falsify(
     plan = plan or Plan()
     if resume:
         scenario, source, shield, plan = _stored(folder, policy, shield)
-    elif folder.exists():
-        check_plan(scenario, plan)
     policy = _load(source) if source is not None else policy
     check_plan(scenario, plan)
     shield_called = shield_name(shield, scenario)
@@ -335,7 +245,7 @@ class _Hunt:
                 "captured": np.sum(result.outcome == OUTCOMES.index("captured")),
                 "collided": np.sum(result.outcome == OUTCOMES.index("collided")),
                 "unconfirmed": unconfirmed,
-                **{which: np.min(getattr(result, which)) for which in _LEAST},
+                **{which: np.min(getattr(result, which)) for which in LEAST},
                 "counterexamples": kept,
                 "seconds": time.perf_counter() - began,
                 "at": self.elapsed,
@@ -349,7 +259,7 @@ class _Hunt:
         kept: list[dict[str, Any]] = []
         unconfirmed = 0
         for outcome in _WANTED[self.plan.goal]:
-            clearances = getattr(result, _clearance_of(outcome))
+            clearances = getattr(result, clearance_of(outcome))
             lost = np.flatnonzero(result.outcome == OUTCOMES.index(outcome))
             count, least = self.tallies[name].deepest(outcome)
             for number in lost[np.argsort(clearances[lost], kind="stable")][:_EXAMINED]:
@@ -357,7 +267,7 @@ class _Hunt:
                 if found is None:
                     unconfirmed += 1
                     continue
-                depth = found.about[_clearance_of(outcome)]
+                depth = found.about[clearance_of(outcome)]
                 inside = found.about["assumption"] is None
                 if count >= self.plan.most and depth >= least - _DEEPER and not inside:
                     continue
@@ -398,7 +308,7 @@ class _Hunt:
     def _summary(self, interrupted: bool) -> dict[str, Any]:
         attacks = {}
         for name, tally in self.tallies.items():
-            figures = {key: getattr(tally, key) for key in (*_COUNTERS, *_LEAST, "first")}
+            figures = {key: getattr(tally, key) for key in (*COUNTERS, *LEAST, "first")}
             attacks[name] = {**figures, "kept": len(tally.kept)}
         found = sorted((e for tally in self.tallies.values() for e in tally.kept), key=lambda e: e["at"])
         assumptions = [entry["assumption"] for entry in found]

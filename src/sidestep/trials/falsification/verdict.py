@@ -9,6 +9,7 @@ import numpy as np
 
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import Status
+from sidestep.safety.shield_check import shield_level
 from sidestep.trials.captures import explain_capture
 from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.trials.rollout import Trajectory
@@ -79,6 +80,19 @@ def judge(
     return _judge_capture(scenario, trajectory, guaranteed_clearance)
 
 
+def certified_clearance(scenario: Scenario, shield: str) -> float | None:
+    """The least clearance (m) from the pursuer that `shield` is computed to keep at this control period.
+
+    Below 0 where a pursuer may get in between two decisions of the shield. None where there is nothing to
+    compute: another shield, several pursuers, a pursuer that wins. Takes seconds.
+    """
+    escapes = bool(CaptureGame.of(scenario).evader_can_escape)
+    if shield not in _PURSUIT_SHIELDS or scenario.pursuer_count != 1 or not escapes:
+        return None
+    kept = shield_level(scenario)
+    return kept.level - kept.error - float(scenario.capture_distance)
+
+
 def _before_all_else(scenario: Scenario, trajectory: Trajectory) -> Verdict | None:
     start: World = jax.tree.map(lambda leaf: leaf[0], trajectory.worlds)
     h = float(escape_margin(scenario, start))
@@ -130,10 +144,10 @@ def _judge_capture(scenario: Scenario, trajectory: Trajectory, guaranteed: float
         return Verdict("rounding", f"the evader was touched by {-clearance:.2g} m, which is rounding")
     depth = f"caught {-1e3 * clearance:.3g} mm deep"
     if guaranteed is not None:
-        allowed = f"the certificate for this control period allows {max(0.0, -1e3 * guaranteed):.3g} mm"
+        allowed = f"at this control period {max(0.0, -1e3 * guaranteed):.3g} mm cannot be ruled out"
         if clearance >= guaranteed - exact:
             return Verdict("sampling", f"{depth}; {allowed}")
-        return Verdict(None, f"{depth}, but {allowed}")
+        return Verdict(None, f"{depth}, but no more than {max(0.0, -1e3 * guaranteed):.3g} mm was possible")
     period, safe = float(scenario.control_period), _safe_period(scenario, game)
     if period > safe:
         return Verdict(
