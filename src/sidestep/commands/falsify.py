@@ -158,26 +158,23 @@ def _millimetres(metres: float | None) -> str:
 
 def attack_table(found: Falsification) -> Any:
     """What each attack came to."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     summary = found.summary
-    table = Table(
-        "attack", "episodes", "caught", "collided", "clearance", "margin h", "obstacle", "kept",
-        title=f"Attacks on the shield {summary['shield']}",
-    )  # fmt: skip
+    title = f"Attacks on the shield {summary['shield']}"
+    table = Table(box=SIMPLE_HEAD, title=title, pad_edge=False, collapse_padding=True)
+    table.add_column("attack", no_wrap=True)
+    for name in ("episodes", "caught", "hit", "pursuer", "margin", "obstacle", "kept"):
+        table.add_column(name, justify="right", no_wrap=True)
     for name, tally in summary["attacks"].items():
-        table.add_row(
-            name,
-            str(tally["episodes"]),
-            str(tally["captured"]),
-            str(tally["collided"]),
-            _millimetres(tally["pursuer_clearance"]),
-            _millimetres(tally["margin"]),
-            _millimetres(tally["obstacle_clearance"]),
-            str(tally["kept"]),
-        )
+        counts = [str(tally[count]) for count in ("episodes", "captured", "collided")]
+        least = [tally[which] for which in ("pursuer_clearance", "margin", "obstacle_clearance")]
+        shown = ["-" if metres is None else f"{1e3 * metres:.3g}" for metres in least]
+        table.add_row(name, *counts, *shown, str(tally["kept"]))
     table.caption = (
-        "least clearance from the pursuer, margin to its capture set and clearance from an obstacle; "
+        "captured, collided; in mm the least clearance from the pursuer, margin to its capture set and "
+        "clearance from an obstacle; "
         f"{summary['control_periods']:,} control periods in {summary['seconds']:.0f} s, "
         f"seed {summary['seed']}, goal {summary['goal']}"
     )
