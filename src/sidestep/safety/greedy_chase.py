@@ -1,8 +1,9 @@
 """The certified law put to the test: games at the boundary against pursuers that react within every period.
 
 Each pursuer sees the velocity that the evader has committed to and takes, of many random bang-bang motions
-of several segments, the one that brings the evader's value lowest. Measurements err as badly as they may, half of them
-toward the wrong side of the pursuer's axis. Nothing here is a proof; it must never contradict one.
+of several segments, the one that brings the evader's value lowest. Measurements err as badly as they may,
+half of them toward the wrong side of the pursuer's axis. Nothing here is a proof; it must never contradict
+one.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Numbers = Float[np.ndarray, "n"]
 
 @dataclass(frozen=True)
 class ChaseResult:
-    """`least_value` (m): the least g_s at the end of a period; `least_distance` (m): the least seen within one."""
+    """`least_value`: the least g_s at the end of a period; `least_distance`: the least within one (m)."""
 
     decisions: int
     least_value: float

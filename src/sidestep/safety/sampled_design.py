@@ -21,14 +21,24 @@ FINE = Cells(32, 48, 24)
 """For the figures that are reported."""
 
 
-def delay_cost(game: SampledGame) -> float:
-    """How much nearer the pursuer can be by now than when it was measured, m: v_e tau, if the delay is short.
+def _unseen(game: SampledGame) -> float:
+    """How far the pursuer can drive between a measurement and the end of the period decided on it, m."""
+    return game.pursuer_speed * (game.period + game.delay)
 
-    Alone it lowers g no faster than V cos S' <= v_e: the evader beside the usable part is not approached
-    faster, and in front the tangent line is what counts.
+
+def delay_cost(game: SampledGame) -> float:
+    """How much nearer the pursuer can be by now than when measured, m: v_e tau, if T and tau are short.
+
+    The evader flees along n at v_e cos(error) >= V cos S', and by t the pursuer has come `advance` of
+    V (t + tau) along n. As long as no detour pays, that is linear and leaves V cos S' tau <= v_e tau.
+    Otherwise nothing that the evader gains is counted.
     """
-    alignment = np.asarray(math.cos(game.usable_angle))
-    return float(advance(np.asarray(game.pursuer_speed * game.delay), alignment, game.half_axle))
+    if game.delay == 0.0:
+        return 0.0
+    alignment = math.cos(game.usable_angle)
+    if _unseen(game) <= 2.0 * game.half_axle * alignment:
+        return game.pursuer_speed * game.delay * alignment
+    return float(advance(np.asarray(_unseen(game)), np.asarray(alignment), game.half_axle))
 
 
 def outruns(game: SampledGame, level: float) -> bool:
@@ -45,6 +55,9 @@ def best_angle(game: SampledGame, level: float, cells: Cells, sections: int = 9)
     low = game.usable_angle
     # Beyond this angle turning alone takes the tip, even from an evader without errors.
     high = math.atan2(game.half_axle * game.evader_speed, game.pursuer_speed * level)
+    # And up to here no detour pays beside the law's normal, see `delay_cost`.
+    if _unseen(game) <= 2.0 * game.half_axle * math.cos(low):
+        high = min(high, math.acos(_unseen(game) / (2.0 * game.half_axle)))
     if not 0.0 < level <= game.largest_capture_distance or high <= low:
         return low, -math.inf
 

@@ -98,13 +98,21 @@ def shield_level(scenario: Scenario) -> ShieldLevel:
         np.linspace(0.4 * wanted, wanted, _LEVELS),
     )
     poses = turn_drive_turn(period, rim, axle)
-    least = np.array([_next_level(scenario, q, angle, 0.15 * wanted, poses, speed, period) for q in levels])
-    reached = np.minimum.accumulate(least[::-1])[::-1]
-    kept = np.flatnonzero((reached >= levels - _ROUNDING) & (levels <= wanted))
-    if len(kept) == 0:
-        return ShieldLevel(0.0, float(levels[0]))
-    best = int(kept[-1])
-    return ShieldLevel(float(levels[best]), float(levels[best + 1] - levels[best]))
+    found = ShieldLevel(0.0, float(levels[0]))
+    # Twice: over all levels, then more finely above the best of them.
+    for _ in range(2):
+        least = np.array(
+            [_next_level(scenario, q, angle, 0.15 * wanted, poses, speed, period) for q in levels]
+        )
+        reached = np.minimum.accumulate(least[::-1])[::-1]
+        kept = np.flatnonzero((reached >= levels - _ROUNDING) & (levels <= wanted))
+        if len(kept) == 0:
+            break
+        best = int(kept[-1])
+        found = ShieldLevel(float(levels[best]), float(levels[best + 1] - levels[best]))
+        above = np.concatenate([[levels[best + 1]], levels[best + 2 :: 4]])
+        levels = np.concatenate([np.linspace(levels[best], levels[best + 1], 13)[:-1], above])
+    return found
 
 
 def _next_level(
