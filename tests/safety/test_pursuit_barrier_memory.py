@@ -116,10 +116,9 @@ def _run_along_the_axis(scenario, shield, pursuer, world, forgetful):
     return jax.lax.scan(step, (world, shield.init(world)), keys)[1]
 
 
-@pytest.mark.parametrize("pursuer", ["nash", "turn-then-drive"])
-def test_no_chattering_in_front_of_a_pursuer(pursuer):
+def test_no_chattering_in_front_of_a_pursuer():
     scenario = load_scenario("paper", obstacle_count=0)
-    shield, chaser = make_shield("game", scenario), make_pursuer(pursuer)
+    shield, chaser = make_shield("game", scenario), make_pursuer("nash")
     world = World(jnp.array([0.8, 1e-4]), jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.array([9.0, 0.0]))
     changes, clearances = [], []
     for forgetful in (False, True):

@@ -252,7 +252,7 @@ def test_rows_and_their_slopes_are_finite_in_every_awkward_place(precision):
             assert np.all(np.isfinite(leaf))
 
 
-def test_wheels_that_are_not_known_count_as_the_worst_and_measured_ones_are_cut_to_the_limit(precision):
+def test_wheels_that_are_not_known_count_as_the_worst_and_measured_ones_are_cut_to_the_limit():
     scenario = load_scenario("paper", pursuer_count=4)
     wheels = jnp.array([[np.nan, 0.1], [0.0, np.inf], [5.0, -5.0], [0.0, 0.0]])
     pose = jnp.array([0.3, 0.1, 3.0])
