@@ -76,8 +76,10 @@ def set_outline(radius: float, angle: float, points: int = 181) -> Float[np.ndar
 
 
 def _grown(certificate: Certificate) -> list[tuple[str, str, float]]:
-    """Label, colour and radius of every budget part that is not 0, from the capture distance outward."""
+    """Label, colour and radius of every budget part that is not 0, outward; none where the pursuer wins."""
     radius, sets = _wanted(certificate), []
+    if certificate.pursuer_wins:
+        return sets
     for name, label, colour in _PARTS:
         part = certificate.budget[name]
         if part > 0.0:
@@ -95,9 +97,10 @@ def _draw_sets(axes: Axes, certificate: Certificate) -> None:
         outline = set_outline(radius, angle)
         axes.add_patch(Polygon(outline, facecolor=colour, edgecolor="white", linewidth=0.4, label=label))
     held = _wanted(certificate)
+    words = "captured at once, driving straight on" if certificate.pursuer_wins else "capture set K(l)"
     fill = Polygon(
         set_outline(held, angle), facecolor="#F3C9B5", edgecolor=PURSUER, linewidth=1.2,
-        label=f"capture set K(l), l = {held:g} m",
+        label=f"{words}, l = {held:g} m",
     )  # fmt: skip
     axes.add_patch(fill)
     limit = certificate.largest_capture_distance
