@@ -9,6 +9,14 @@ import pytest
 LIMIT = 0.1574
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The look-ahead of `joint` takes long to compile: in float64 it is tested by name (`-m slow`)."""
+    for item in items:
+        parameters = getattr(getattr(item, "callspec", None), "params", {})
+        if parameters.get("name") == "joint" and parameters.get("precision"):
+            item.add_marker(pytest.mark.slow)
+
+
 @dataclass
 class Problems:
     """A batch: nominal (n, 2), normals (n, k, 2), offsets (n, k); `limit` is the same for all."""

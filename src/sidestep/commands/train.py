@@ -29,7 +29,7 @@ class Train:
     scenario: ScenarioName = "paper"
     """Preset (paper, paper-test) or a TOML or JSON file."""
     shield: ShieldName = "game"
-    """Shield during training: none, paper or game."""
+    """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = "nash"
     """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still."""
     episodes: int = 200

@@ -1,4 +1,4 @@
-"""What keeps the evader free: the exact filter, barriers and their rows, shields and their status."""
+"""What keeps the evader free: the exact filter, barriers and their rows, shields, the certificate."""
 
 from sidestep.safety.barriers import (
     BARRIERS,
@@ -9,17 +9,11 @@ from sidestep.safety.barriers import (
     RangeBarrier,
     compose,
 )
+from sidestep.safety.catalogue import SHIELDS, as_shield, make_shield
+from sidestep.safety.certificate import Certificate, certify
 from sidestep.safety.filter import Projection, project, tolerance
-from sidestep.safety.shields import (
-    SHIELDS,
-    GameShield,
-    NoShield,
-    PaperShield,
-    Shield,
-    ShieldResult,
-    as_shield,
-    make_shield,
-)
+from sidestep.safety.joint import JointShield
+from sidestep.safety.shields import GameShield, NoShield, PaperShield, Shield, ShieldResult
 from sidestep.safety.status import Status
 
 __all__ = [
@@ -27,7 +21,9 @@ __all__ = [
     "SHIELDS",
     "Barrier",
     "BarrierRows",
+    "Certificate",
     "GameShield",
+    "JointShield",
     "NoShield",
     "ObstacleBarrier",
     "PaperShield",
@@ -38,6 +34,7 @@ __all__ = [
     "ShieldResult",
     "Status",
     "as_shield",
+    "certify",
     "compose",
     "make_shield",
     "project",

@@ -22,8 +22,6 @@ from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
-_PLANNED = ("joint",)
-
 
 class ShieldResult(eqx.Module):
     """What a shield decided.
@@ -172,25 +170,3 @@ class GameShield(Shield):
         rows = _with_obstacles(PursuitBarrier(), self.scenario, world, memory)
         hard = self.scenario.pursuer_count
         return _decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
-
-
-SHIELDS: dict[str, type[Shield]] = {"none": NoShield, "paper": PaperShield, "game": GameShield}
-"""Every shield by name."""
-
-
-def make_shield(name: str, scenario: Scenario) -> Shield:
-    """The shield `name` (a key of `SHIELDS`) for a scenario.
-
-    **Raises** `ValueError` naming the known shields.
-    """
-    if name in SHIELDS:
-        return SHIELDS[name](scenario)
-    known = ", ".join(map(repr, SHIELDS))
-    if name in _PLANNED:
-        raise ValueError(f"shield {name!r} is planned but not built yet; use one of {known}")
-    raise ValueError(f"no shield {name!r}; use one of {known}")
-
-
-def as_shield(shield: str | Shield, scenario: Scenario) -> Shield:
-    """`shield` itself, or the one of that name for `scenario`."""
-    return make_shield(shield, scenario) if isinstance(shield, str) else shield

@@ -1,0 +1,248 @@
+"""The shield `joint`: no capture and no collision, by looking ahead inside the rows of `game`."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sidestep._arrays import AnyArray, Flag, Scalar, norm, real
+from sidestep.pursuit import Pursuer, make_pursuer, pursue
+from sidestep.safety.by_need import by_need
+from sidestep.safety.look_ahead import STRETCHES, WISHES, Outlook, clearance, imagine, stretch, wish
+from sidestep.safety.shields import GameShield, Shield, ShieldResult
+from sidestep.safety.status import Status
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+MODELS = ("nash", "turn-then-drive", "turn-while-driving", "pure-pursuit", "interceptor")
+"""The pursuers that an imagined chase is held against."""
+_VARIANTS = 12
+_FORGET = 0.9
+_SURPRISED = 0.1
+_GIVE = 0.001
+
+
+class JointMemory(eqx.Module):
+    """What the shield keeps in mind.
+
+    `sides (m,)` of the pursuit barrier; `way (stretches,)` the way out that it counts on, if `counts`;
+    `expected (models, m, 2)` the wheel speeds (m/s) that each model would have driven last, and `surprise
+    (models,)` by how much it was wrong of late, as a share of the wheel speed; `calls ()` so far.
+    """
+
+    sides: Float[Array, "m"]
+    way: Int[Array, "stretches"]
+    age: Scalar
+    counts: Flag
+    expected: Float[Array, "models m 2"]
+    surprise: Float[Array, "models"]
+    calls: Int[Array, ""]
+
+
+class _Decision(eqx.Module):
+    """`accept` the nominal action, or else follow `way`; whether that way out is `clear`."""
+
+    accept: Flag
+    way: Int[Array, "stretches"]
+    age: Scalar
+    clear: Flag
+
+
+class _Situation(eqx.Module):
+    """What a decision is made from."""
+
+    world: World
+    action: Float[Array, "2"]
+    sides: Float[Array, "m"]
+    way: Int[Array, "stretches"]
+    age: Scalar
+    wheels: Float[Array, "models m 2"]
+    live: Array
+    key: PRNGKeyArray
+
+
+@final
+class JointShield(Shield):
+    """The `game` shield with a look-ahead inside its rows.
+
+    An action is accepted if, after it, the way out that the shield counts on (see `look_ahead`) stays clear
+    of pursuers and obstacles for the whole horizon against every pursuer of `models`. Else a new one is
+    sought among all constant wishes and random variations of the old one: of those that stay clear against
+    all, the one whose first wish is closest to the action; if there is none, the one that stays clear
+    longest, first against those models that drive as the pursuers have been seen to, then against all.
+
+    Whatever is driven has passed the rows of `game`, pursuers first: what holds for that shield holds for
+    this one too. What the look-ahead adds towards obstacles is measured, not proved.
+
+    It is run only near: `near_obstacle` and `near_pursuer` bound the clearance of the nearest obstacle and
+    the pursuit barrier's value (m) up to which the rows cannot vouch on their own. Clear means `margin` (m)
+    away from obstacles, or what there is now if that is less. `pursuer_gain` (1/s) replaces the scenario's:
+    a larger one leaves more room to move. A chase is imagined `horizon` (s) ahead, first in `fine_steps` of
+    the robot's own control period, then in `coarse_steps` longer ones; `lenience` (m) is how much closer to
+    a pursuer the longer ones may come. The decision carries no derivatives; the action does.
+    """
+
+    scenario: Scenario
+    pursuer_gain: Scalar = eqx.field(converter=real, default=2.0)
+    near_obstacle: Scalar = eqx.field(converter=real, default=0.5)
+    near_pursuer: Scalar = eqx.field(converter=real, default=0.5)
+    margin: Scalar = eqx.field(converter=real, default=0.02)
+    lenience: Scalar = eqx.field(converter=real, default=0.005)
+    horizon: Scalar = eqx.field(converter=real, default=6.0)
+    fine_steps: int = eqx.field(static=True, default=40)
+    coarse_steps: int = eqx.field(static=True, default=40)
+    models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
+
+    @property
+    def _game(self) -> GameShield:
+        return GameShield(eqx.tree_at(lambda s: s.pursuer_gain, self.scenario, self.pursuer_gain))
+
+    def init(self, world: World) -> JointMemory:
+        count, m = len(self.models), self.scenario.pursuer_count
+        return JointMemory(
+            sides=self._game.init(world),
+            way=jnp.full(STRETCHES, WISHES - 1, jnp.int32),
+            age=jnp.zeros_like(world.time),
+            counts=jnp.zeros((), bool),
+            expected=jnp.broadcast_to(world.wheel_speeds, (count, m, 2)),
+            surprise=jnp.zeros(count, world.evader.dtype),
+            calls=jnp.zeros((), jnp.int32),
+        )
+
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory
+    ) -> tuple[ShieldResult, JointMemory]:
+        game = self._game
+        greedy, sides = game(world, nominal, memory.sides)
+        m = self.scenario.pursuer_count
+        if self.scenario.obstacle_count == 0 or m == 0:
+            return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides)
+        near = jnp.min(greedy.barriers[m:]) <= self.near_obstacle
+        need = near & (jnp.min(greedy.barriers[:m]) <= self.near_pursuer)
+        # What is not known cannot be imagined.
+        need &= greedy.status != Status.INVALID
+
+        wrong = jnp.max(jnp.abs(memory.expected - world.wheel_speeds), axis=(1, 2))
+        wrong = jnp.where(memory.calls > 0, wrong, 0.0) / self.scenario.pursuer_speed
+        wrong = jnp.where(jnp.isfinite(wrong), wrong, 1.0)
+        surprise = jnp.maximum(_FORGET * memory.surprise, wrong)
+        live = surprise < _SURPRISED
+        live |= ~jnp.any(live)
+        models = tuple(make_pursuer(name) for name in self.models)
+        key = jax.random.key(0)
+        wheels = jnp.stack([pursue(self.scenario, model, world, key) for model in models])
+        situation = _Situation(
+            world,
+            greedy.action,
+            sides,
+            memory.way,
+            memory.age,
+            wheels,
+            live,
+            jax.random.fold_in(key, memory.calls),
+        )
+        decision = self._look(need, memory.counts, situation)
+
+        length = self.horizon / STRETCHES
+        chosen = wish(self.scenario, world, sides, stretch(decision.way, decision.age, length))
+        evasive, _ = game(world, chosen, memory.sides)
+        nominal = jnp.asarray(nominal, chosen.dtype)
+        wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
+        evasive = eqx.tree_at(
+            lambda result: (result.status, result.intervention),
+            evasive,
+            (jnp.maximum(evasive.status, Status.CORRECTED), norm(evasive.action - wanted)),
+        )
+        result = jax.tree.map(lambda a, b: jnp.where(decision.accept, a, b), greedy, evasive)
+        return result, JointMemory(
+            sides,
+            decision.way,
+            decision.age + self.scenario.control_period,
+            need & decision.clear,
+            wheels,
+            surprise,
+            memory.calls + 1,
+        )
+
+    def _look(self, need: Flag, counts: Flag, situation: _Situation) -> _Decision:
+        """Whether the action may be taken, and the way out counted on or to be taken instead."""
+        arrays, fixed = eqx.partition(self, eqx.is_array)
+        arrays, situation = jax.lax.stop_gradient((arrays, situation))
+        idle = _Decision(~need, situation.way, situation.age, jnp.zeros((), bool))
+
+        def confirm(arrays: Any, situation: _Situation) -> _Decision:
+            clear = eqx.combine(arrays, fixed)._confirm(situation)
+            return _Decision(clear, situation.way, situation.age, clear)
+
+        def search(arrays: Any, situation: _Situation) -> _Decision:
+            return eqx.combine(arrays, fixed)._search(situation)
+
+        quick = by_need(confirm, need & counts, idle, arrays, situation)
+        return by_need(search, ~quick.accept, quick, arrays, situation, width=4)
+
+    def _confirm(self, situation: _Situation) -> Flag:
+        """Whether the way out counted on stays clear after the action, whichever model drives."""
+        after = [
+            self.scenario.step(situation.world, situation.action, wheels)[0] for wheels in situation.wheels
+        ]
+        worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves)[:, None], *after)
+        outlook = self._imagine(worlds, situation.sides, situation.way[None], situation.age[None])
+        return jnp.min(outlook.least) >= self._floor(situation.world)
+
+    def _floor(self, world: World) -> Scalar:
+        """The clearance (m) that a way out must keep: the margin, or what there is now if that is less."""
+        now = clearance(self.scenario, world, self.lenience)
+        return jnp.clip(now - _GIVE, 0.0, self.margin)
+
+    def _search(self, situation: _Situation) -> _Decision:
+        choice_key, wish_key = jax.random.split(situation.key)
+        constant = jnp.broadcast_to(jnp.arange(WISHES, dtype=jnp.int32)[:, None], (WISHES, STRETCHES))
+        shape = (_VARIANTS, STRETCHES)
+        length = self.horizon / STRETCHES
+        starts = situation.age + length * jnp.arange(STRETCHES).astype(length.dtype)
+        rest = jax.vmap(stretch, in_axes=(None, 0, None))(situation.way, starts, length)
+        other = jax.random.randint(wish_key, shape, 0, WISHES, jnp.int32)
+        variants = jnp.where(jax.random.bernoulli(choice_key, 0.5, shape), other, rest)
+        ways = jnp.concatenate([situation.way[None], constant, variants])
+        ages = jnp.zeros(len(ways), length.dtype).at[0].set(situation.age)
+        count = len(self.models)
+        worlds = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, len(ways), *leaf.shape)), situation.world
+        )
+        outlook = self._imagine(worlds, situation.sides, ways, ages)
+        clear = jnp.min(outlook.least, axis=0) >= self._floor(situation.world)
+        likely = jnp.min(jnp.where(situation.live[:, None], outlook.time, jnp.inf), axis=0)
+        always = jnp.min(outlook.time, axis=0)
+        first = jax.vmap(lambda number: wish(self.scenario, situation.world, situation.sides, number))(
+            ways[:, 0]
+        )
+        correction = norm(first - situation.action)
+        best = jnp.where(
+            jnp.any(clear),
+            jnp.argmin(jnp.where(clear, correction, jnp.inf)),
+            jnp.argmax(100.0 * likely + always + jnp.min(outlook.least, axis=0)),
+        )
+        return _Decision(jnp.zeros((), bool), ways[best], ages[best], jnp.any(clear))
+
+    def _imagine(self, worlds: World, sides: Any, ways: Any, ages: Any) -> Outlook:
+        models: tuple[Pursuer, ...] = tuple(make_pursuer(name) for name in self.models)
+        all_sides = jnp.broadcast_to(sides, (len(models), len(ways), *sides.shape))
+        fine = jnp.broadcast_to(self.scenario.control_period, self.fine_steps)
+        rest = (self.horizon - jnp.sum(fine)) / self.coarse_steps
+        periods = jnp.concatenate([fine, jnp.broadcast_to(rest, self.coarse_steps)])
+        return imagine(
+            self.scenario,
+            self._game,
+            models,
+            worlds,
+            all_sides,
+            ways,
+            ages,
+            periods,
+            self.horizon / STRETCHES,
+            self.lenience,
+        )
