@@ -13,7 +13,7 @@ from sidestep.trials.keys import episode_key, start_and_pursuit
 from sidestep.world import World, load_scenario
 
 # Of the first 300 random starts from key 7, some in which `game` collides while heading for the target.
-LOST_BY_GAME = (46, 146, 252)
+LOST_BY_GAME = (153, 224, 242)
 
 
 def _starts(scenario, numbers):

@@ -18,13 +18,14 @@ def with_depth(trajectory, clearance):
     return eqx.tree_at(lambda t: t.events.pursuer_clearance, trajectory, values)
 
 
-def collision(trajectory, *, infeasible):
-    """The same episode, but lost to an obstacle."""
+def collision(trajectory, *, infeasible, depth=1e-3):
+    """The same episode, but lost to an obstacle, `depth` m deep."""
     status = jnp.full(trajectory.length, Status.INFEASIBLE if infeasible else Status.CORRECTED)
+    events = trajectory.events
     return eqx.tree_at(
-        lambda t: (t.events.captured, t.events.collided, t.status),
+        lambda t: (t.events.captured, t.events.collided, t.events.obstacle_clearance, t.status),
         trajectory,
-        (trajectory.events.collided, trajectory.events.captured, status),
+        (events.collided, events.captured, events.obstacle_clearance.at[-1].set(-depth), status),
     )
 
 
@@ -117,6 +118,8 @@ def test_numbers_that_are_not_finite_are_named(chase):
 def test_collision_is_excused_only_where_the_rows_could_not_all_hold(chase, shield):
     assert judge(PAPER, shield, collision(chase(), infeasible=True)).assumption == "alone"
     assert judge(PAPER, shield, collision(chase(), infeasible=False)).inside
+    touched = collision(chase(), infeasible=False, depth=1e-8)
+    assert judge(PAPER, shield, touched).assumption == "rounding"
 
 
 def test_obstacle_faster_than_the_evader_is_named(chase):

@@ -120,7 +120,7 @@ def _drive(
 
     def period(carry: _Drive, key: PRNGKeyArray) -> tuple[_Drive, Float[Array, "2"]]:
         world, memory, events, result, _ = control_step(
-            scenario, shield, pursuer, carry.world, carry.memory, nominal, key
+            scenario, shield, pursuer, carry.world.set_apart(~carry.alive), carry.memory, nominal, key
         )
         tally = carry.tally
         moved = _Drive(

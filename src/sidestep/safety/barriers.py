@@ -21,7 +21,7 @@ from sidestep.world.state import World
 
 _KEEP_SIDE = 0.5
 _STEEPER = 1.5
-_LOST_SIDE = 0.1
+_LOST_SIDE = 0.005
 
 _NormalAndRate: TypeAlias = tuple[Float[Array, "2"], Scalar]
 

@@ -181,8 +181,8 @@ class JointShield(Shield):
         def search(arrays: Any, situation: _Situation) -> _Decision:
             return eqx.combine(arrays, fixed)._search(situation)
 
-        quick = by_need(confirm, need & counts, idle, arrays, situation)
-        return by_need(search, ~quick.accept, quick, arrays, situation, width=4)
+        quick = by_need(confirm, need & counts, idle, arrays, situation, width=4)
+        return by_need(search, ~quick.accept, quick, arrays, situation, width=1)
 
     def _confirm(self, situation: _Situation) -> Flag:
         """Whether the way out counted on stays clear after the action, whichever model drives."""

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from sidestep.safety.barriers import PursuitBarrier
 from sidestep.safety.flow_map import seen_from, side_value, turn_drive_turn
+from sidestep.safety.sampling_margin import guarded
 from sidestep.world.scenario import Scenario
 
 _LEVELS = 80
@@ -88,6 +89,7 @@ def _allowed(
 
 def shield_level(scenario: Scenario) -> ShieldLevel:
     """The level that the `game` shield keeps against every pursuer, for exact measurements, on the grid."""
+    scenario = guarded(scenario)
     speed, period = float(scenario.evader_speed), float(scenario.control_period)
     rim, axle = float(scenario.pursuer_speed), float(scenario.pursuer_half_axle)
     wanted, angle = float(scenario.capture_distance), float(scenario.usable_angle)

@@ -18,6 +18,7 @@ from sidestep.safety.barriers import (
 )
 from sidestep.safety.filter import project
 from sidestep.safety.least_violation import root
+from sidestep.safety.sampling_margin import TOUCH, guarded, sampling_margin
 from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -79,9 +80,11 @@ def _decide(
     *,
     enforced: bool,
     hard: int,
+    known: Bool[Array, "n"] | None = None,
 ) -> ShieldResult:
     nominal = jnp.asarray(nominal, rows.values.dtype)
-    known = _known(world) & jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
+    known = _known(world) if known is None else known
+    known &= jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
     known &= jnp.all(jnp.isfinite(rows.normals), axis=-1)
     wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
     # With part of the world unknown nothing vouches for the nominal action.
@@ -157,16 +160,48 @@ class GameShield(Shield):
 
     Against one pursuer in the unbounded plane, in continuous time and with l <= l_max, the pursuit row can
     always be kept, and then there is no capture. Sampling, several pursuers and obstacles beside them are
-    outside that statement.
+    outside that statement. For the pursuer's turns within a period the rows keep `sampling_margin` more than
+    the capture distance; the barriers that are reported are those of the capture distance itself.
+
+    `known_velocity=True` is for a pursuer whose next wheel speeds are known, because it announces them or
+    they can be computed: whoever calls puts them into `world.wheel_speeds`. The rows are then those of
+    `PursuitBarrier.rows_over_period`, two for each pursuer, which need no margin and interfere less.
     """
 
     scenario: Scenario
+    known_velocity: bool = eqx.field(static=True, default=False)
 
     def init(self, world: World) -> Any:
         return PursuitBarrier().remember(self.scenario, world)
 
     def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
-        memory = PursuitBarrier().remember(self.scenario, world, memory)
-        rows = _with_obstacles(PursuitBarrier(), self.scenario, world, memory)
-        hard = self.scenario.pursuer_count
-        return _decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
+        if self.known_velocity:
+            return self._over_period(world, nominal, memory)
+        kept, m = guarded(self.scenario), self.scenario.pursuer_count
+        memory = PursuitBarrier().remember(kept, world, memory)
+        rows = _with_obstacles(PursuitBarrier(), kept, world, memory)
+        values = rows.values.at[:m].add(sampling_margin(self.scenario)).at[m:].add(TOUCH)
+        rows = eqx.tree_at(lambda rows: rows.values, rows, values)
+        return _decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
+
+    def _over_period(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
+        barrier, obstacle, m = PursuitBarrier(), ObstacleBarrier(), self.scenario.pursuer_count
+        memory = barrier.remember(self.scenario, world, memory)
+        rows = compose(
+            barrier.rows_over_period(self.scenario, world, memory),
+            obstacle.rows(self.scenario, world, obstacle.remember(self.scenario, world)),
+        )
+        known = _known(world)
+        result = _decide(
+            self.scenario,
+            world,
+            nominal,
+            rows,
+            enforced=True,
+            hard=2 * m,
+            known=jnp.concatenate([jnp.repeat(known[:m], 2), known[m:]]),
+        )
+        once = jnp.concatenate([result.barriers[: 2 * m : 2], result.barriers[2 * m :]])
+        return eqx.tree_at(lambda result: result.barriers, result, once), memory

@@ -102,8 +102,9 @@ def _advance(
     def period(episode: Episode, nominal: Array) -> Episode:
         _, pursuit_key = start_and_pursuit(episode_key(key, episode.number))
         step_key = jax.random.fold_in(pursuit_key, episode.steps)
+        running = episode.outcome == RUNNING
         world, memory, events, result, _ = control_step(
-            scenario, shield, pursuer, episode.world, episode.memory, nominal, step_key
+            scenario, shield, pursuer, episode.world.set_apart(~running), episode.memory, nominal, step_key
         )
         moved = Episode(
             number=episode.number,
@@ -120,7 +121,7 @@ def _advance(
             correction=episode.correction + result.intervention,
             max_correction=jnp.maximum(episode.max_correction, result.intervention),
         )
-        return _select(episode.outcome == RUNNING, moved, episode)
+        return _select(running, moved, episode)
 
     def decision(episode: Episode) -> Episode:
         nominal = decide(scenario, policy, episode.world)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Scalar, real
+from sidestep._arrays import AnyArray, Flag, Scalar, real
 
 
 class World(eqx.Module):
@@ -64,4 +64,17 @@ class World(eqx.Module):
             lambda world: (world.pursuers, world.wheel_speeds),
             self,
             (jnp.roll(self.pursuers, -index, axis=0), jnp.roll(self.wheel_speeds, -index, axis=0)),
+        )
+
+    def set_apart(self, when: Flag) -> World:
+        """The same world, but with pursuers and obstacles a kilometre further off where `when`.
+
+        For an episode that has ended and is only stepped on because others of its batch have not: out there
+        no shield has anything to think about.
+        """
+        off = jnp.where(when, 1000.0, 0.0)
+        return eqx.tree_at(
+            lambda world: (world.pursuers, world.obstacles),
+            self,
+            (self.pursuers.at[:, 0].add(off), self.obstacles.at[:, 0].add(off)),
         )

@@ -72,9 +72,9 @@ def one_period(
     target: Target, pursuer: Callable[..., Any], chase: Chase, nominal: Array, key: PRNGKeyArray
 ) -> tuple[Chase, Float[Array, "m 2"]]:
     """A chase one control period later, and the wheel speeds (m/s) asked for; one that ended stays."""
-    scenario = target.scenario
+    scenario, running = target.scenario, chase.outcome == RUNNING
     world, memory, events, _, wheels = control_step(
-        scenario, target.shield, pursuer, chase.world, chase.memory, nominal, key
+        scenario, target.shield, pursuer, chase.world.set_apart(~running), chase.memory, nominal, key
     )
     moved = Chase(
         world=world,
@@ -86,7 +86,6 @@ def one_period(
         obstacle_clearance=jnp.minimum(chase.obstacle_clearance, events.obstacle_clearance),
         margin=jnp.minimum(chase.margin, escape_margin(scenario, world)),
     )
-    running = chase.outcome == RUNNING
     pick = lambda new, old: jnp.where(running, new, old)  # noqa: E731
     return jax.tree.map(pick, moved, chase), jnp.where(running, wheels, 0.0)
 

@@ -111,6 +111,9 @@ def _judge_collision(scenario: Scenario, shield: str, trajectory: Trajectory) ->
     fastest = float(np.max(speeds, initial=0.0))
     if fastest > float(scenario.evader_speed):
         return Verdict("slow-obstacles", f"an obstacle drifts at {fastest:.3g} m/s")
+    clearance = float(np.min(np.asarray(trajectory.events.obstacle_clearance)))
+    if clearance > -_exact(trajectory):
+        return Verdict("rounding", f"the obstacle was touched by {-clearance:.2g} m, which is rounding")
     stuck = np.flatnonzero(np.asarray(trajectory.status) == Status.INFEASIBLE)
     if len(stuck):
         since = float(stuck[0]) * float(scenario.control_period)
@@ -138,8 +141,7 @@ def _judge_capture(scenario: Scenario, trajectory: Trajectory, guaranteed: float
     if not bool(game.evader_can_escape):
         return Verdict("winner", f"the capture distance {reach:.4g} m exceeds l_max = {largest:.4g} m")
     clearance = float(np.min(np.asarray(trajectory.events.pursuer_clearance)))
-    extent = float(np.max(np.abs(np.asarray(trajectory.worlds.evader)), initial=1.0))
-    exact = _ROUNDING * float(np.finfo(np.asarray(trajectory.worlds.evader).dtype).eps) * extent
+    exact = _exact(trajectory)
     if clearance > -exact:
         return Verdict("rounding", f"the evader was touched by {-clearance:.2g} m, which is rounding")
     depth = f"caught {-1e3 * clearance:.3g} mm deep"
@@ -156,6 +158,13 @@ def _judge_capture(scenario: Scenario, trajectory: Trajectory, guaranteed: float
             "which none was ever seen",
         )
     return Verdict(None, f"{depth}, at a control period of {1e3 * period:.3g} ms")
+
+
+def _exact(trajectory: Trajectory) -> float:
+    """How exactly distances are known in the numbers' precision, m."""
+    evader = np.asarray(trajectory.worlds.evader)
+    extent = float(np.max(np.abs(evader), initial=1.0))
+    return _ROUNDING * float(np.finfo(evader.dtype).eps) * extent
 
 
 def _safe_period(scenario: Scenario, game: CaptureGame) -> float:
