@@ -101,6 +101,10 @@ class JointShield(Shield):
     def _game(self) -> GameShield:
         return GameShield(eqx.tree_at(lambda s: s.pursuer_gain, self.scenario, self.pursuer_gain))
 
+    @property
+    def rows_only(self) -> GameShield:
+        return self._game
+
     def init(self, world: World) -> JointMemory:
         count, m = len(self.models), self.scenario.pursuer_count
         return JointMemory(

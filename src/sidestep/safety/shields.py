@@ -49,6 +49,12 @@ class Shield(eqx.Module):
 
     scenario: eqx.AbstractVar[Scenario]
 
+    @property
+    def rows_only(self) -> "Shield":
+        """The shield to learn through: its rows, whose derivatives say how the executed action follows the
+        nominal one, without anything that is costly and has none. The shield itself if it is all rows."""
+        return self
+
     @abc.abstractmethod
     def init(self, world: World) -> Any:
         """The memory (a pytree) at the start of an episode."""
