@@ -25,6 +25,7 @@ OPTIONS = {
     "reward_scale": 0.01,
     "correction_penalty": 0.0,
     "replay_action": "proposed",
+    "filter_gradients": False,
     "bound_values": True,
     "last_layer_scale": 0.01,
 }

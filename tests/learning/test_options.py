@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from sidestep.commands.common import parse_overrides
 from sidestep.learning import TD3, TrainingOptions, make_options, options_to_dict
 
 SHARES = {"hindsight", "mirror", "discount", "target_rate"}
@@ -29,7 +30,7 @@ WHOLE = {
     "replay_capacity",
     "policy_delay",
 }
-OTHERS = {"hidden", "replay_action", "bound_values"}
+OTHERS = {"hidden", "replay_action", "bound_values", "filter_gradients"}
 ALL = {field.name for owner in (TD3, TrainingOptions) for field in dataclasses.fields(owner)} - {"algorithm"}
 
 BAD = [
@@ -46,7 +47,7 @@ BAD = [
     ),
     *(("hidden", value) for value in ((), (0,), (16, -1), (16.0,), (True,), 16, "16", None, ((16,),))),
     *(("replay_action", value) for value in ("both", "", None, 1, ["proposed"])),
-    *(("bound_values", value) for value in (1, 0, "true", None)),
+    *((name, value) for name in ("bound_values", "filter_gradients") for value in (1, 0, "true", None)),
 ]
 
 
@@ -77,12 +78,16 @@ CHANGED = {
     "hidden": (8, 9, 10),
     "replay_action": "executed",
     "bound_values": False,
+    "filter_gradients": True,
 }
+COMPANIONS = {"filter_gradients": {"replay_action": "executed"}}
+"""Options that make sense only beside others."""
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
 def test_each_option_arrives_alone_and_comes_back_from_json(precision, name):
-    options, plain = make_options(**{name: CHANGED[name]}), make_options()
+    companions = COMPANIONS.get(name, {})
+    options, plain = make_options(**{name: CHANGED[name]}, **companions), make_options(**companions)
     stored = json.loads(json.dumps(options_to_dict(options)))
     assert set(stored) == ALL
     given = options_to_dict(plain) | {name: CHANGED[name]}
@@ -94,6 +99,23 @@ def test_each_option_arrives_alone_and_comes_back_from_json(precision, name):
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(options), strict=True):
         assert ours.dtype == theirs.dtype == (np.float64 if precision else np.float32)
         assert ours == theirs
+
+
+@pytest.mark.parametrize("given", [{}, {"replay_action": "proposed"}])
+def test_filter_between_actor_and_a_critic_of_proposed_actions_is_refused(given):
+    """It would be filtered twice, and a price on corrections would never reach the actor."""
+    with pytest.raises(ValueError, match=r"'filter_gradients' = True.*replay_action='executed'"):
+        make_options(filter_gradients=True, **given)
+    with pytest.raises(ValueError, match="filter_gradients"):
+        TrainingOptions(filter_gradients=True, **given)
+
+
+def test_what_the_command_line_is_told_about_corrections_arrives():
+    written = ("correction_penalty=2.5", "replay_action=executed", "filter_gradients=true")
+    stored = options_to_dict(make_options(**parse_overrides(written)))
+    assert stored["correction_penalty"] == 2.5
+    assert stored["replay_action"] == "executed"
+    assert stored["filter_gradients"] is True
 
 
 def test_ends_of_ranges_are_allowed():

@@ -71,7 +71,13 @@ def reward_by_hand(path, steps, lost, target):
     return total, lost
 
 
-def draw(replay, key, rows=512, *, mirror=0.0, hindsight=1.0, executed=False, penalty=0.0, scale=1.0):
+def draw(replay, key, **more):
+    """A batch and the worlds after it."""
+    batch, _, after = draw_all(replay, key, **more)
+    return batch, after
+
+
+def draw_all(replay, key, rows=512, *, mirror=0.0, hindsight=1.0, executed=False, penalty=0.0, scale=1.0):
     scenario = load_scenario("paper", reach_distance=REACH)
     return _draw(
         scenario, replay, key, rows, real(hindsight), real(mirror), executed, real(penalty), real(scale)
@@ -230,10 +236,15 @@ def test_mirrored_rows_are_the_same_rows_seen_in_a_mirror():
     np.testing.assert_array_equal(mirrored.reward, plain.reward)
     np.testing.assert_array_equal(mirrored.terminated, plain.terminated)
     np.testing.assert_allclose(after_mirror.target, after.target * np.array([1.0, -1.0]), atol=1e-6)
-    half, _ = draw(replay, jax.random.key(4), mirror=0.5)
+    half, *half_worlds = draw_all(replay, jax.random.key(4), mirror=0.5)
     whole, _ = draw(replay, jax.random.key(4))
     flipped = np.any(np.abs(np.asarray(half.observation - whole.observation)) > 1e-6, axis=-1)
     assert flipped.mean() == pytest.approx(0.5, abs=0.06)
+    # Whatever else is computed in the worlds of a batch belongs to its rows: observed, they are its rows.
+    look = jax.jit(jax.vmap(lambda world: observe(scenario, world)))
+    for worlds, seen in zip(half_worlds, (half.observation, half.next_observation), strict=True):
+        np.testing.assert_allclose(look(worlds), seen, atol=1e-6)
+        np.testing.assert_array_equal(np.asarray(worlds.evader)[:, 1] < 0.0, flipped & (worlds.time > 0))
 
 
 def random_worlds(count, seed):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import real
-from sidestep.learning.replay import on_disc
+from sidestep.learning.bounds import on_disc
 from sidestep.learning.td3 import TD3, Batch, update
 
 OBSERVATIONS, ACTIONS, ROWS, UPDATES = 3, 2, 12, 7

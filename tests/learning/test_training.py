@@ -1,5 +1,7 @@
 """Hazard: a training loop that is not the one asked for: another end, seed, action, precision, program."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,13 +9,14 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import real
+from sidestep.learning.bounds import on_disc
 from sidestep.learning.records import CONVERGENCE_WINDOW
-from sidestep.learning.replay import on_disc, sample
+from sidestep.learning.replay import sample
 from sidestep.learning.td3 import update
 from sidestep.learning.training import _learn, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
-from sidestep.world import observe, to_action
+from sidestep.world import observe
 
 
 def test_training_stops_exactly_at_its_last_episode_whatever_the_chunk(small, small_run):
@@ -124,10 +127,8 @@ def test_seeds_and_learning_rates_under_vmap_train_as_they_do_alone(small, x64):
 # Which action is learned from ------------------------------------------------------------------------------
 
 
-class Elsewhere(eqx.Module):
-    """A shield that always answers with the same velocity."""
-
-    velocity: jax.Array
+class Turned(eqx.Module):
+    """A shield of anyone's own: half of every velocity, turned by where the robots are."""
 
     def init(self, world):
         return ()
@@ -136,7 +137,7 @@ class Elsewhere(eqx.Module):
         from sidestep.safety.shields import ShieldResult
 
         result = ShieldResult(
-            action=self.velocity,
+            action=half_turned(world, nominal),
             status=jnp.asarray(1, jnp.int32),
             barriers=jnp.zeros(2),
             slack=real(0.0),
@@ -145,17 +146,32 @@ class Elsewhere(eqx.Module):
         return result, memory
 
 
-def test_executed_actions_are_learned_from_with_the_target_action_through_the_shield(small, small_run):
-    scenario = small.scenario()
-    shield = Elsewhere(real([0.05, -0.1]))
-    replay = small_run.state.replay
-    # Steep target critics and no bonus, so that the target action makes a difference.
+def half_turned(world, vector):
+    angle = 20.0 * world.evader[1] + 10.0 * world.pursuers[0, 0] + 1.0
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return 0.5 * jnp.stack([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
+
+
+def test_executed_actions_are_learned_from_through_the_shield_of_their_own_world(small, small_run):
+    """The target action through that of the world after; the actor's, if asked for, of the one before."""
+    scenario, replay, key = small.scenario(), small_run.state.replay, jax.random.key(11)
+    # Steep target critics and no bonus, so that the target action makes a difference; the next update is one
+    # that moves the actor, and without momentum its moments tell its gradient.
     learner = eqx.tree_at(
-        lambda x: x.target_critic,
+        lambda x: (x.target_critic, x.updates, x.actor_moments),
         small_run.state.learner,
-        jax.tree.map(lambda w: 5.0 * w, small_run.state.learner.critic),
+        (
+            jax.tree.map(lambda w: 5.0 * w, small_run.state.learner.critic),
+            jnp.asarray(1),
+            jax.tree.map(jnp.zeros_like, small_run.state.learner.actor_moments),
+        ),
     )
-    options, key = small.options(replay_action="executed", hindsight=0.0), jax.random.key(11)
+    asked = {"replay_action": "executed", "hindsight": 0.0}
+
+    def slope(result):
+        return np.asarray(result[0].actor_moments.mu.body.weights[-1])
+
+    options = small.options(**asked)
 
     @jax.jit
     def by_hand(learner):
@@ -167,19 +183,37 @@ def test_executed_actions_are_learned_from_with_the_target_action_through_the_sh
             "correction_penalty": options.correction_penalty,
             "reward_scale": options.reward_scale,
         }
-        batch, after = sample(scenario, replay, sample_key, 16, **settings)
-        shielded = jax.vmap(lambda world: to_action(scenario, world, shield.velocity))(after)
+        batch, before, after = sample(scenario, replay, sample_key, 16, **settings)
+
+        def shielded(worlds):
+            # A turn of the velocity is the same turn of the action, whatever their axes.
+            return lambda actions, key: jax.vmap(half_turned)(worlds, on_disc(actions, key))
+
         return [
-            update(options.algorithm, learner, batch, update_key, on_disc, target, real(10.0))
-            for target in (lambda actions, key: shielded, on_disc)
+            update(options.algorithm, learner, batch, update_key, bound, target, real(10.0))
+            for bound, target in (
+                (on_disc, shielded(after)),
+                (shielded(before), shielded(after)),
+                (on_disc, on_disc),
+                (shielded(after), shielded(after)),
+            )
         ]
 
-    expected, unshielded = by_hand(learner)
-    actual = jax.jit(lambda learner: _learn(scenario, shield, options, learner, replay, key))(learner)
-    leaves = small.leaves_of(actual)
-    for name, leaf in small.leaves_of(expected).items():
-        np.testing.assert_allclose(leaf, leaves[name], rtol=1e-4, atol=1e-5, err_msg=name)
-    assert abs(float(unshielded[1].critic / expected[1].critic) - 1.0) > 2e-3
+    *expected, no_target, wrong_world = by_hand(learner)
+    for filtered, wanted in zip((False, True), expected, strict=True):
+        chosen = small.options(**asked, filter_gradients=filtered)
+        learn = jax.jit(lambda x, chosen=chosen: _learn(scenario, Turned(), chosen, x, replay, key))
+        actual = learn(learner)
+        leaves = small.leaves_of(actual)
+        for name, leaf in small.leaves_of(wanted).items():
+            np.testing.assert_allclose(leaf, leaves[name], rtol=1e-4, atol=1e-5, err_msg=name)
+        largest = np.max(np.abs(slope(wanted)))
+        np.testing.assert_allclose(slope(actual), slope(wanted), rtol=0.0, atol=1e-3 * largest)
+
+    # What it is told apart from.
+    assert abs(float(no_target[1].critic / expected[0][1].critic) - 1.0) > 2e-3
+    for other in (expected[0], wrong_world):
+        assert np.max(np.abs(slope(other) - slope(expected[1]))) > 0.05 * largest
 
 
 def test_each_choice_of_replay_action_trains_and_gives_another_policy(small):
@@ -189,16 +223,19 @@ def test_each_choice_of_replay_action_trains_and_gives_another_policy(small):
         "proposed": small.train(scenario),
         "penalty": small.train(scenario, small.options(correction_penalty=50.0)),
         "executed": small.train(scenario, small.options(replay_action="executed")),
+        "through the filter": small.train(
+            scenario, small.options(replay_action="executed", filter_gradients=True)
+        ),
     }
     assert sum(line["interventions"] for line in runs["proposed"].metrics) > 20
-    critics = []
+    actors = []
     for training in runs.values():
         assert len(training.metrics) == 8
         leaves = small.leaves_of(training.state.learner)
         assert all(np.all(np.isfinite(leaf)) for leaf in leaves.values())
-        critics.append(leaves[".critic.first.weights[0]"])
-    for i in range(3):
-        assert not np.allclose(critics[i], critics[i - 1], atol=1e-6)
+        actors.append(leaves[".actor.body.weights[0]"])
+    for one, other in itertools.combinations(actors, 2):
+        assert not np.allclose(one, other, atol=1e-6)
 
 
 # Does it learn? --------------------------------------------------------------------------------------------

@@ -28,7 +28,13 @@ class TrainingOptions(eqx.Module):
     - `bound_values`: cut target values at the reward for reaching, since no return can exceed it.
     - `replay_action`: `"proposed"` (the policy's) or `"executed"` (the shield's answer; the target
       action then passes through the shield too).
-    - `correction_penalty`: reward taken off per decision in which the shield corrected by v_e throughout.
+    - `filter_gradients`: pass the actor's action through the shield as well before the critic judges it, so
+      that the actor climbs along the derivative of the executed action with respect to the proposed one.
+      For executed actions only: a critic of proposed ones has the shield inside it already, and would be
+      asked about an action filtered twice.
+    - `correction_penalty`: reward taken off per decision in which the shield corrected by v_e throughout, in
+      the units of the paper's reward. It is a price on what was proposed; a critic of executed actions
+      sees it only as a price on the actions that corrections end in.
     - `replay_capacity`: transitions kept; never more than the training can produce.
     """
 
@@ -40,11 +46,19 @@ class TrainingOptions(eqx.Module):
     mirror: Scalar = eqx.field(converter=real, default=0.5)
     bound_values: bool = eqx.field(static=True, default=True)
     replay_action: str = eqx.field(static=True, default="proposed")
+    filter_gradients: bool = eqx.field(static=True, default=False)
     decision_steps: int = eqx.field(static=True, default=10)
     batch_size: int = eqx.field(static=True, default=256)
     updates_per_decision: int = eqx.field(static=True, default=2)
     warmup_decisions: int = eqx.field(static=True, default=256)
     replay_capacity: int = eqx.field(static=True, default=1_000_000)
+
+    def __check_init__(self) -> None:
+        if self.filter_gradients and self.replay_action != "executed":
+            raise ValueError(
+                f"training option 'filter_gradients' = True: it needs replay_action='executed', not "
+                f"{self.replay_action!r}, whose critic has the shield inside it already"
+            )
 
 
 _FLOATS = {
@@ -103,7 +117,7 @@ def _checked(name: str, value: Any) -> Any:
         if not _is_number(value) or not math.isfinite(value) or value != int(value) or value < _WHOLE[name]:
             fail(f"it must be a whole number of at least {_WHOLE[name]}")
         return int(value)
-    if name == "bound_values":
+    if name in ("bound_values", "filter_gradients"):
         if not isinstance(value, bool):
             fail("it must be true or false")
     elif name == "replay_action":

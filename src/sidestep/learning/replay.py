@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from sidestep._arrays import Flag, Scalar, real
 from sidestep.learning.td3 import Batch
 from sidestep.world import Scenario, World, observe, to_action
-from sidestep.world.robots import closest_approach_straight, limit_speed
+from sidestep.world.robots import closest_approach_straight
 
 
 class Transition(eqx.Module):
@@ -141,14 +141,15 @@ def sample(
     executed_action: bool,
     correction_penalty: Float[Array, ""],
     reward_scale: Float[Array, ""],
-) -> tuple[Batch, World]:
+) -> tuple[Batch, World, World]:
     """A batch of uniform transitions, a share `hindsight` of them with a place reached later as target.
 
     The later place is uniform over the rest of the same episode (the "future" strategy). The action is
     the proposed or the executed velocity in the policy's axes *for that target*; the reward is scaled by
     `reward_scale` after `correction_penalty` times the mean correction (as a share of v_e) is taken off.
 
-    **Returns** the batch and the worlds after it, whose targets are the sampled ones.
+    **Returns** the batch, and the worlds before and after its actions: with the sampled targets, and mirrored
+    where the batch is, so that whatever is computed in them (a shield's answer, say) belongs to its rows.
     """
     index_key, later_key, choice_key, knot_key, mirror_key = jax.random.split(key, 5)
     # Slots count back from the newest, so that sampling is uniform over what the ring still holds.
@@ -194,9 +195,4 @@ def sample(
         next_observation=jax.vmap(observe, in_axes=(None, 0))(scenario, next_world),
         terminated=terminated.astype(reward.dtype),
     )
-    return batch, next_world
-
-
-def on_disc(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
-    """Actions as the robot executes them: norm cut to one (`to_velocity` does the same to the policy's)."""
-    return jax.vmap(limit_speed, in_axes=(0, None))(actions, real(1.0))
+    return batch, world, next_world

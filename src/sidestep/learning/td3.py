@@ -8,6 +8,7 @@ is the training loop's business.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -98,6 +99,13 @@ def _adam(gradients, moments, network, rate: Scalar):
     return jax.tree.map(lambda weight, direction: weight - rate * direction, network, directions), moments
 
 
+def actor_loss(
+    actor: Actor, critic: TwinCritic, observation: Float[Array, "batch observation"], bound: Bound, key: Any
+) -> Scalar:
+    """-mean Q1(s, bound(pi(s))): what the actor descends."""
+    return -jnp.mean(critic.first_value(observation, bound(actor(observation), key)))
+
+
 def update(
     algorithm: TD3,
     learner: Learner,
@@ -113,10 +121,10 @@ def update(
     loss is the *sum* of the two mean squared errors. Every `policy_delay` updates the actor climbs Q1
     and both target networks move.
 
-    `bound` maps actions onto those the robot can execute (a disc, say) before any critic judges them;
-    `target_bound` does so for the target action alone (the safety filter, when executed actions are
-    learned from) and is `bound` unless given. `value_limit`, when given, is the largest value there can be:
-    y is cut to it.
+    `bound` maps actions onto those the robot can execute (a disc, say) before any critic judges them, and
+    the actor's gradient goes through it; `target_bound` does so for the target action alone (the safety
+    filter in the worlds after, when executed actions are learned from) and is `bound` unless given.
+    `value_limit`, when given, is the largest value there can be: y is cut to it.
     """
     noise_key, bound_key, actor_key = jax.random.split(key, 3)
     target_bound = bound if target_bound is None else target_bound
@@ -140,11 +148,9 @@ def update(
     )
 
     def delayed(learner: Learner) -> tuple[Learner, Scalar]:
-        def actor_loss(actor: Actor) -> Scalar:
-            actions = bound(actor(batch.observation), actor_key)
-            return -jnp.mean(critic.first_value(batch.observation, actions))
-
-        loss, gradients = jax.value_and_grad(actor_loss)(learner.actor)
+        loss, gradients = jax.value_and_grad(actor_loss)(
+            learner.actor, critic, batch.observation, bound, actor_key
+        )
         actor, moments = _adam(gradients, learner.actor_moments, learner.actor, algorithm.actor_learning_rate)
         rate = algorithm.target_rate
 

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, Flag, Scalar, real
+from sidestep.learning.bounds import on_disc, through_shield
 from sidestep.learning.control_step import RUNNING, control_step, outcome_of
 from sidestep.learning.options import TrainingOptions
-from sidestep.learning.replay import Replay, Transition, on_disc, sample
+from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Learner, Losses, update
 from sidestep.safety.status import Status
-from sidestep.world import Scenario, World, observation_size, observe, to_action, to_velocity
+from sidestep.world import Scenario, World, observation_size, observe, to_velocity
 
 
 class Tally(eqx.Module):
@@ -170,7 +171,7 @@ def _learn(
 ) -> tuple[Learner, Losses]:
     def one(learner: Learner, key: PRNGKeyArray) -> tuple[Learner, Losses]:
         sample_key, update_key = jax.random.split(key)
-        batch, next_world = sample(
+        batch, world, next_world = sample(
             scenario,
             replay,
             sample_key,
@@ -181,17 +182,11 @@ def _learn(
             correction_penalty=options.correction_penalty,
             reward_scale=options.reward_scale,
         )
-
-        def through_shield(actions: Array, key: PRNGKeyArray) -> Array:
-            def filtered(world: World, action: Array) -> Array:
-                result, _ = shield(world, to_velocity(scenario, world, action), shield.init(world))
-                return to_action(scenario, world, result.action)
-
-            return jax.vmap(filtered)(next_world, actions)
-
-        target_bound = through_shield if options.replay_action == "executed" else on_disc
+        executed = options.replay_action == "executed"
+        target_bound = through_shield(scenario, shield, next_world) if executed else on_disc
+        bound = through_shield(scenario, shield, world) if options.filter_gradients else on_disc
         best = options.reward_scale * scenario.reach_reward if options.bound_values else None
-        return update(options.algorithm, learner, batch, update_key, on_disc, target_bound, best)
+        return update(options.algorithm, learner, batch, update_key, bound, target_bound, best)
 
     learner, losses = jax.lax.scan(one, learner, jax.random.split(key, options.updates_per_decision))
     return learner, jax.tree.map(lambda loss: loss[-1], losses)
