@@ -1,19 +1,29 @@
 """The command line: what it writes, what it refuses, and that a refusal touches nothing."""
 
+import inspect
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from sidestep.cli import main
 from sidestep.commands.common import parse_overrides
+from sidestep.commands.falsify import Falsify
+from sidestep.commands.reproduce import Reproduce
+from sidestep.commands.train import Train
+from sidestep.learning import train
+from sidestep.safety.catalogue import SHIELDS
+from sidestep.trials.reproduction import reproduce
 
 LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
-SMALL = ["--episodes", "2", "--set", "episode_steps=60", "--learner", *LEARNER]
+# The look-ahead of the default shield takes long to compile; what is tested here is the same under any.
+SMALL = ["--shield", "game", "--episodes", "2", "--set", "episode_steps=60", "--learner", *LEARNER]
 
 SUMMARY_KEYS = [
     "episodes",
@@ -30,6 +40,7 @@ SUMMARY_KEYS = [
     "min_obstacle_clearance",
     "intervention_rate",
     "infeasible_rate",
+    "mean_correction",
     "scenario",
     "shield",
     "pursuer",
@@ -74,6 +85,15 @@ def test_evaluation_reports_counts_with_their_bounds(run, tmp_path):
         assert figures[f"{name}_rate_low"] <= figures[f"{name}_rate"] <= figures[f"{name}_rate_high"]
     assert "reach_time_median" in figures
     assert figures["shield"] == "game"
+
+
+def test_untrained_policy_is_evaluated_under_the_joint_shield_by_default(tmp_path):
+    path = tmp_path / "evaluation.json"
+    small = ["--scenario", "paper-test", "--set", "episode_steps=30", "--episodes", "2", "--batch", "2"]
+    assert main(["evaluate", *small, "--json", str(path)]) == 0
+    figures = json.loads(path.read_text())
+    assert figures["shield"] == "joint"
+    assert figures["timed_out"] == figures["episodes"] == 2
 
 
 def test_resumed_run_is_the_longer_run(run, tmp_path):
@@ -153,12 +173,28 @@ def test_bad_input_is_named_and_nothing_is_written(arguments, named, tmp_path, c
     assert not out.exists()
 
 
-@pytest.mark.parametrize("command", [[], ["train"], ["evaluate"], ["reproduce"], ["report"]])
+@pytest.mark.parametrize(
+    "command", [[], ["train"], ["evaluate"], ["reproduce"], ["certify"], ["falsify"], ["report"]]
+)
 def test_help_of_every_command(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([*command, "--help"])
     assert stop.value.code == 0
     assert "sidestep" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "falsify"])
+def test_help_says_which_shield_is_taken_unless_told_otherwise(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    words = re.sub(r"[^\w:,;' ]+", " ", capsys.readouterr().out)
+    assert re.search(r"default:\s+joint|joint,\s+by\s+default", words)
+
+
+def test_every_command_takes_the_same_default_shield():
+    assert Train(out=Path("x")).shield == Falsify().shield == "joint"
+    assert inspect.signature(train).parameters["shield"].default == "joint"
+    assert inspect.signature(reproduce).parameters["shields"].default == Reproduce().shields == tuple(SHIELDS)
 
 
 def test_overrides_are_numbers_lists_or_text():

@@ -192,6 +192,10 @@ def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
     assert summary["env_steps"] == 2900
     assert summary["intervention_rate"] == 0.1
     assert summary["infeasible_rate"] == 0.01
+    assert summary["mean_correction"] == pytest.approx(0.01)
+    # Longer episodes weigh more: the mean is over periods.
+    unequal = [episode(1, steps=300, mean_correction=0.04), episode(2, steps=100, mean_correction=0.0)]
+    assert summarise(unequal, wall_seconds=0.0, **about)["mean_correction"] == pytest.approx(0.03)
     assert summary["min_pursuer_clearance"] == 0.05
     assert summary["min_obstacle_clearance"] == 0.4
     assert summary["final_return"] == 990.0
@@ -202,5 +206,6 @@ def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
     assert empty["episodes"] == 0
     assert empty["final_return"] is None
     assert empty["intervention_rate"] is None
+    assert empty["mean_correction"] is None
     with pytest.raises(RunError, match="crashed"):
         summarise([episode(1, "crashed")], wall_seconds=0.0, **about)

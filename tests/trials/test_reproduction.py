@@ -32,6 +32,13 @@ def test_study_leaves_everything_it_reports(study):
     assert game.training["episodes"] == 2
     assert game.trained["episodes"] == game.untrained["episodes"] == 8
     assert game.scene_trained.length <= 60
+    for part in ("training", "trained", "untrained", "scene_trained", "scene_untrained"):
+        figures = summary["shields"]["game"][part]
+        assert 0.0 <= figures["infeasible_rate"] <= figures["intervention_rate"] <= 1.0
+        assert 0.0 <= figures["mean_correction"] <= 2 * 0.1574
+    assert summary["shields"]["game"]["scene_trained"]["seconds"] == pytest.approx(
+        0.05 * game.scene_trained.length, abs=1e-4
+    )
     for name in ("policy.npz", "evaluation.json", "evaluation_untrained.json", "test_scene.npz"):
         assert (out / "game" / name).is_file()
 
@@ -62,6 +69,12 @@ def test_bad_shields_are_refused_before_anything_is_written(tmp_path):
             reproduce(tmp_path / "out", **{**SMALL, "shields": shields})
     with pytest.raises(ValueError, match="pursuer"):
         reproduce(tmp_path / "out", pursuer="nobody", **SMALL)
+    assert not (tmp_path / "out").exists()
+
+
+def test_company_that_the_test_scene_has_no_place_for_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="obstacle_count"):
+        reproduce(tmp_path / "out", scenario=load_scenario("paper", obstacle_count=3), **SMALL)
     assert not (tmp_path / "out").exists()
 
 

@@ -20,11 +20,19 @@ from sidestep.views import (
     trajectory_figure,
 )
 from sidestep.views.scene import capture_set_outline, mark_periods
-from sidestep.views.style import OUTCOME_COLOURS, OUTCOME_MARKERS, shield_colour
+from sidestep.views.style import (
+    OUTCOME_COLOURS,
+    OUTCOME_MARKERS,
+    shield_colour,
+    shield_dashes,
+    shield_words,
+)
+from sidestep.views.training_figures import shows_episodes
 from sidestep.world import Scenario
 from sidestep.world.capture_geometry import capture_set_distance
 
 PAPER = Scenario()
+SHIELDS = ("none", "paper", "game", "joint")
 
 
 def assert_fine(written):
@@ -67,9 +75,38 @@ def test_users_own_matplotlib_settings_are_left_alone_and_ignored(tmp_path, run_
     assert plain[0].read_bytes() == styled[0].read_bytes()
 
 
-def test_outcomes_differ_in_shape_as_well_as_in_colour():
+def test_outcomes_and_shields_differ_in_shape_as_well_as_in_colour():
     assert len(set(OUTCOME_MARKERS.values())) == len(set(OUTCOME_COLOURS.values())) == 4
-    assert len({shield_colour(name) for name in ("none", "paper", "game", "joint")}) == 4
+    assert len({shield_colour(name) for name in SHIELDS}) == len(SHIELDS)
+    assert len({str(shield_dashes(name)) for name in SHIELDS}) == len(SHIELDS)
+
+
+def drawn(monkeypatch, module, draw):
+    """The figure that `draw` would have saved."""
+    figures = []
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            f"sidestep.views.{module}.save", lambda figure, path: (figures.append(figure), (path, path))[1]
+        )
+        draw()
+    return figures[0]
+
+
+def test_each_shield_keeps_its_colour_whichever_others_are_shown(tmp_path, run_of, monkeypatch):
+    for shields in (("joint", "none", "game", "paper"), ("joint",), ("game", "joint")):
+        runs = [run_of(shield) for shield in shields]
+        figure = drawn(monkeypatch, "training_figures", lambda runs=runs: reward_figure(runs, tmp_path / "x"))
+        lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+        for shield in shields:
+            assert lines[shield_words(shield)].get_color() == shield_colour(shield)
+
+
+def test_returns_of_many_shields_do_not_cover_each_other(tmp_path, run_of, monkeypatch):
+    for shields, dots in ((("none", "joint"), 2), (SHIELDS, 0)):
+        runs = [run_of(shield) for shield in shields]
+        assert shows_episodes(runs) == bool(dots)
+        figure = drawn(monkeypatch, "training_figures", lambda runs=runs: reward_figure(runs, tmp_path / "x"))
+        assert len(figure.axes[0].collections) == dots
 
 
 def test_safety_table_counts_what_the_metrics_say(tmp_path, run_of):
@@ -88,9 +125,9 @@ def test_safety_table_counts_what_the_metrics_say(tmp_path, run_of):
     assert_fine(safety_table(runs, tmp_path / "safety"))
 
 
-def test_outcome_figure_shows_zero_and_all(tmp_path):
+def test_outcome_figure_shows_zero_and_all(tmp_path, monkeypatch):
     evaluations = {}
-    for shield, captured in (("none", 100), ("game", 0)):
+    for shield, captured in (("none", 100), ("paper", 30), ("game", 0), ("joint", 0)):
         evaluations[shield] = report = {}
         counts = {"captured": captured, "collided": 0, "timed_out": 0, "reached": 100 - captured}
         for name, count in counts.items():
@@ -102,9 +139,17 @@ def test_outcome_figure_shows_zero_and_all(tmp_path):
                 f"{name}_rate_high": high,
             }
     assert_fine(outcome_figure(evaluations, tmp_path / "outcomes"))
+    untrained = {shield: evaluations[shield] for shield in ("game", "joint")}
+    assert_fine(outcome_figure(evaluations, tmp_path / "both", untrained))
+    figure = drawn(
+        monkeypatch, "training_figures", lambda: outcome_figure(evaluations, tmp_path / "x", untrained)
+    )
+    faces = [line.get_markerfacecolor() for line in figure.axes[0].get_lines() if line.get_marker() == "o"]
+    assert len(faces) == 6
+    assert faces.count("white") == 2
 
 
-@pytest.mark.parametrize("shield", ["", "paper", "game"])
+@pytest.mark.parametrize("shield", ["", "paper", "joint"])
 def test_trajectory_figure(tmp_path, shield, chase):
     assert_fine(trajectory_figure(PAPER, chase(), tmp_path / "scene", shield=shield))
 
@@ -115,14 +160,48 @@ def test_trajectory_figure_of_any_company_and_length(tmp_path, obstacles, pursue
     assert_fine(trajectory_figure(PAPER, trajectory, tmp_path / "scene", moment=1e9))
 
 
+def test_trace_shows_every_status_with_its_share(tmp_path, chase, monkeypatch):
+    trajectory = chase(gap=0.5)
+    status = np.zeros(trajectory.length, np.int32)
+    status[10:15], status[30], status[-1:] = 1, 2, 3
+    status[20:22] = 1
+    trajectory = replace(trajectory, status=jnp.asarray(status))
+    figure = drawn(
+        monkeypatch, "trajectory_figures", lambda: trajectory_figure(PAPER, trajectory, tmp_path / "x")
+    )
+    answers = figure.axes[-1]
+    spans = [collection.get_paths() for collection in answers.collections]
+    assert [len(paths) for paths in spans] == [4, 2, 1, 1]
+    corrected = [path.get_extents() for path in spans[1]]
+    assert np.allclose([(box.x0, box.x1) for box in corrected], [(0.5, 0.75), (1.0, 1.1)])
+    words = [text.get_text() for text in answers.get_legend().get_texts()]
+    assert words[1] == f"corrected, {700 / trajectory.length:.1f} %"
+    assert len(words) == 4
+
+
+@pytest.mark.parametrize("shield", ["none", "paper", "game", "joint"])
+def test_level_sets_are_those_of_the_shields_own_barrier(tmp_path, chase, monkeypatch, shield):
+    asked = []
+    place = "sidestep.views.trajectory_figures.draw_barrier_levels"
+    monkeypatch.setattr(place, lambda *_, pursuit: asked.append(pursuit))
+    drawn(
+        monkeypatch,
+        "trajectory_figures",
+        lambda: trajectory_figure(PAPER, chase(steps=20), tmp_path / "x", shield=shield),
+    )
+    assert asked == [shield in ("game", "joint")]
+
+
 def test_trajectory_with_an_unknown_world_can_be_drawn(tmp_path, chase):
     trajectory = chase()
     unknown = replace(trajectory, barriers=trajectory.barriers.at[3].set(-jnp.inf))
     assert_fine(trajectory_figure(PAPER, unknown, tmp_path / "scene"))
 
 
-def test_scenes_figure(tmp_path, chase):
-    assert_fine(scenes_figure(PAPER, {"none": chase(), "game": chase(steps=50)}, tmp_path / "scenes"))
+@pytest.mark.parametrize("shields", [("joint",), ("none", "game"), SHIELDS], ids=len)
+def test_scenes_figure(tmp_path, chase, shields):
+    scenes = {shield: chase(steps=50 + 100 * i) for i, shield in enumerate(shields)}
+    assert_fine(scenes_figure(PAPER, scenes, tmp_path / "scenes"))
 
 
 @pytest.mark.parametrize("reverse", [False, True])

@@ -106,6 +106,20 @@ def test_report_says_what_the_data_say(whole):
     assert words.index("Paper's shield") < words.index("Game shield")
 
 
+def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, tmp_path, run_of):
+    assert "joint shield adds" not in read(whole).words
+    runs = [run_of(shield) for shield in ("joint", "game", "none", "paper")]
+    words = read(write_report(runs, tmp_path / "r.html")).words
+    assert words.index("No shield") < words.index("Paper's shield")
+    assert words.index("Paper's shield") < words.index("Game shield") < words.index("Joint shield")
+    assert "What the joint shield adds" in words
+    assert "20.0 %" in words.partition("periods corrected")[2][:60]
+    assert "0.0100 m/s" in words.partition("mean correction")[2][:60]
+    # Four shields' single episodes are not drawn, so the caption must not speak of them.
+    assert "Faint" not in words
+    assert "Faint" in read(whole).words
+
+
 def test_report_escapes_what_it_shows(tmp_path, run_of):
     run = run_of()
     config = {**run.config, "pursuer": "<script>alert(1)</script>"}

@@ -6,7 +6,7 @@ import abc
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
@@ -50,20 +50,25 @@ def write_json_file(path: Path | None, data: Any) -> None:
 class _Bar(abc.ABC):
     """A progress bar on the error stream, so that results alone go to standard output.
 
-    A context manager that gives its `update`.
+    A context manager that gives its `update`. The bar itself is drawn from `bar_from_width` columns on.
     """
+
+    bar_from_width: ClassVar[int] = 80
 
     def __init__(self, console: Console, label: str):
         from rich.console import Console as RichConsole
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+        screen = RichConsole(stderr=True)
+        # In a narrow terminal the words need the room of the bar.
+        bar = [BarColumn(bar_width=24)] if screen.width >= self.bar_from_width else []
         self._progress = Progress(
             TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
+            *bar,
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
-            console=RichConsole(stderr=True),
+            console=screen,
         )
         self._task = self._progress.add_task(label, total=None, note="compiling")
 
@@ -80,13 +85,15 @@ class _Bar(abc.ABC):
 
 
 class TrainingBar(_Bar):
-    """Episode, steps per second, mean return of the last 20 episodes, safe count."""
+    """Episode, steps per second, safe count, return of the last episode, mean of the last 20."""
+
+    bar_from_width = 110
 
     def update(self, *values: Any) -> None:
         progress: Progress = values[0]
         note = f"{progress.steps_per_second:,.0f} steps/s  safe {progress.safe}"
         if progress.last is not None:
-            note += f"  return {progress.last['return']:.0f} (mean of 20: {progress.mean_return:.0f})"
+            note += f"  return {progress.last['return']:.0f}, mean {progress.mean_return:.0f}"
         self._progress.update(self._task, total=progress.episodes, completed=progress.episode, note=note)
 
 

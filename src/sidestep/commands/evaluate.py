@@ -25,7 +25,7 @@ class Evaluate:
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Shield; the run's own, or game, by default."""
+    """Shield: none, paper, game or joint; the run's own, or joint, by default."""
     pursuer: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Pursuer strategy; the run's own, or nash, by default."""
     episodes: int = 1000
@@ -57,9 +57,9 @@ def run(command: Evaluate, console: Console) -> int:
         scenario = load_scenario("paper", **{**config["scenario"], **overrides})
     else:
         scenario = load_scenario(command.scenario or "paper", **overrides)
-    shield = command.shield or config.get("shield", "game")
+    shield = command.shield or config.get("shield", "joint")
     pursuer = command.pursuer or config.get("pursuer", "nash")
-    with CountBar(console, f"episodes, {shield} shield, {pursuer} pursuer") as show:
+    with CountBar(console, f"{shield} shield, {pursuer}") as show:
         evaluation = run_evaluation(
             scenario, policy, shield, pursuer, command.episodes, command.seed, batch=command.batch,
             progress=show,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class Falsify:
     """Search for a pursuer, and a start, that break a shield; keep what is found, ready to play again."""
 
-    shield: ShieldName = "game"
+    shield: ShieldName = "joint"
     """Shield to attack."""
     policy: Annotated[str, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
     """Run folder whose policy steers the evader, or goal-seeking for the untrained one."""

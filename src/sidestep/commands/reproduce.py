@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
 
 from sidestep.commands.common import (
     CountBar,
@@ -18,17 +22,22 @@ from sidestep.commands.common import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.trials.reproduction import ShieldStudy
+    from sidestep.views.comparison import Section
 
 
 @dataclass(frozen=True)
 class Reproduce:
-    """Reproduce the paper: train, evaluate and test under several shields, then compare and report."""
+    """Reproduce the paper: train, evaluate and test under each shield, then compare and report."""
 
     out: Path = Path("runs/reproduce")
-    """Folder to write; one run folder per shield, summary.json, figures and report.html."""
-    shields: tuple[str, ...] = ("none", "paper", "game")
-    """Shields to compare."""
+    """Folder to write; one run folder per shield, summary.json, comparison.md, figures and report.html."""
+    shields: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = (
+        "none",
+        "paper",
+        "game",
+        "joint",
+    )
+    """Shields to compare: none, paper, game and joint."""
     pursuer: PursuerName = "nash"
     """Pursuer strategy."""
     episodes: int = 200
@@ -50,9 +59,9 @@ class Reproduce:
 def run(command: Reproduce, console: Console) -> int:
     """Run `sidestep reproduce`; returns the exit status."""
     from sidestep.learning import make_options
-    from sidestep.learning.records import read_summary
+    from sidestep.learning.records import read_summary, write_bytes
     from sidestep.trials.reproduction import reproduce as run_study
-    from sidestep.views import write_report
+    from sidestep.views import comparison_sections, markdown_tables, write_report
     from sidestep.world import load_scenario
 
     try:
@@ -66,64 +75,53 @@ def run(command: Reproduce, console: Console) -> int:
             evaluation_episodes=command.evaluation_episodes,
             options=make_options(**parse_overrides(command.learner)),
             resume=command.resume,
-            training_progress=lambda shield: TrainingBar(console, f"training, {shield} shield"),
+            training_progress=lambda shield: TrainingBar(console, f"training, {shield}"),
             count_progress=lambda label: CountBar(console, label),
         )
     except KeyboardInterrupt:
         console.print(f"Interrupted. Continue with: sidestep reproduce --out {command.out} --resume")
         return 130
-    console.print(comparison_table(studies))
+    summary = read_summary(command.out)
+    sections = comparison_sections(summary)
+    for table in comparison_tables(sections):
+        console.print(table)
+        console.print()
+    write_bytes(command.out / "comparison.md", markdown_tables(sections).encode())
     report = write_report(
         [study.folder for study in studies],
         command.out / "report.html",
-        command=f"sidestep reproduce --seed {command.seed}",
+        command=command_line(command),
     )
-    write_json_file(command.json, read_summary(command.out))
+    write_json_file(command.json, summary)
     console.print(f"Report with figures: {report}")
     return 0
 
 
-def comparison_table(studies: list[ShieldStudy]) -> Any:
-    """The paper's figures beside ours, a column per shield."""
+def comparison_tables(sections: list[Section]) -> Iterator[Any]:
+    """The paper's figures beside ours as tables of one layout; four shields fit into 80 columns."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from sidestep.trials.reproduction import PAPER, describe
+    for section in sections:
+        table = Table(
+            title=section.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False,
+            pad_edge=False, padding=(0, 1, 0, 0),
+        )  # fmt: skip
+        table.add_column("", min_width=23, no_wrap=True)
+        for index, name in enumerate(section.columns):
+            table.add_column(name, justify="right", min_width=8 if index == 0 else 9, no_wrap=True)
+        for label, cells in section.rows:
+            table.add_row(label, *cells, style="dim" if label.startswith(" ") else "")
+        yield table
 
-    table = Table(
-        "", "paper reports", *(f"{study.shield} shield" for study in studies), title="The paper and us"
-    )
 
-    def row(label: str, paper: str, values: list[str]) -> None:
-        table.add_row(label, paper, *values)
-
-    def bounded(figures: dict[str, Any], name: str) -> str:
-        low, high = figures[f"{name}_rate_low"], figures[f"{name}_rate_high"]
-        return f"{figures[f'{name}_rate']:.1%} ({low:.1%} to {high:.1%})"
-
-    trainings = [study.training for study in studies]
-    row("training: episodes", str(PAPER["episodes"]), [str(t["episodes"]) for t in trainings])
-    row("training: safe episodes", str(PAPER["safe_episodes"]), [str(t["safe_episodes"]) for t in trainings])
-    row("  captured / collided", "0 / 0", [f"{t['captured']} / {t['collided']}" for t in trainings])
-    row(
-        "  converged by episode",
-        str(PAPER["converged_within"]),
-        ["never" if t["converged_episode"] is None else str(t["converged_episode"]) for t in trainings],
-    )
-    row(
-        "  return of the last 20",
-        f"{PAPER['converged_return']:.0f}",
-        [f"{t['final_return']:.0f}" for t in trainings],
-    )
-    for label, attribute in (("trained policy", "trained"), ("goal-seeking policy", "untrained")):
-        results = [getattr(study, attribute) for study in studies]
-        row(f"{label}, random starts", "-", [f"{r['episodes']} episodes" for r in results])
-        for name in ("captured", "collided", "reached"):
-            row(f"  {name} (95 % bounds)", "-", [bounded(r, name) for r in results])
-    for label, attribute in (("trained policy", "scene_trained"), ("goal-seeking policy", "scene_untrained")):
-        scenes = [describe(getattr(study, attribute)) for study in studies]
-        row(
-            f"test scene, {label}",
-            PAPER["scene_outcome"] if attribute == "scene_trained" else "-",
-            [f"{s['outcome'].replace('_', ' ')}, {s['seconds']:.1f} s" for s in scenes],
-        )
-    return table
+def command_line(command: Reproduce) -> str:
+    """What to type to run the study again; the folder is left to whoever types it."""
+    parts = ["sidestep reproduce"]
+    plain = Reproduce()
+    for name in ("shields", "pursuer", "episodes", "evaluation_episodes", "set", "learner"):
+        value = getattr(command, name)
+        if value != getattr(plain, name):
+            words = value if isinstance(value, tuple) else (str(value),)
+            parts.append(f"--{name.replace('_', '-')} {' '.join(shlex.quote(word) for word in words)}")
+    return " ".join([*parts, f"--seed {command.seed}"])

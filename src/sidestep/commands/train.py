@@ -28,7 +28,7 @@ class Train:
     """Run folder to write; never overwritten silently."""
     scenario: ScenarioName = "paper"
     """Preset (paper, paper-test) or a TOML or JSON file."""
-    shield: ShieldName = "game"
+    shield: ShieldName = "joint"
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = "nash"
     """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still."""
@@ -64,7 +64,7 @@ def run(command: Train, console: Console) -> int:
             "episodes": command.episodes,
             "options": make_options(**parse_overrides(command.learner)),
         }
-    with TrainingBar(console, f"training, {settings['shield']} shield") as show:
+    with TrainingBar(console, f"training, {settings['shield']}") as show:
         training = run_training(**settings, out=command.out, resume=command.resume, progress=show)
     console.print(training_table(training.summary))
     write_json_file(command.json, training.summary)
@@ -85,7 +85,7 @@ def training_table(summary: dict[str, Any]) -> Any:
     for key in (
         "episodes", "safe_episodes", "captured", "collided", "reached", "timed_out", "converged_episode",
         "final_return", "min_pursuer_clearance", "min_obstacle_clearance", "intervention_rate",
-        "infeasible_rate", "env_steps", "wall_seconds",
+        "mean_correction", "infeasible_rate", "env_steps", "wall_seconds",
     ):  # fmt: skip
         value = summary[key]
         shown = "never" if value is None and key == "converged_episode" else value

@@ -215,8 +215,8 @@ def summarise(
     **Returns** counts per outcome, `safe_episodes` (neither captured nor collided), `env_steps` (control
     periods simulated), `converged_episode`, `final_return` (mean of the last 20 episodes, of all if fewer),
     the smallest clearances (m), and the shares of control periods in which the shield corrected the action
-    (`intervention_rate`) or could not satisfy its rows (`infeasible_rate`). What needs an episode is null
-    without one.
+    (`intervention_rate`) or could not satisfy its rows (`infeasible_rate`), and how far it changed the
+    velocity on average over all of them (`mean_correction`, m/s). What needs an episode is null without one.
     """
     counts = {name: sum(episode["outcome"] == name for episode in metrics) for name in OUTCOMES}
     if sum(counts.values()) != len(metrics):
@@ -232,6 +232,8 @@ def summarise(
     def share(key: str) -> float | None:
         return sum(int(episode[key]) for episode in metrics) / steps if steps else None
 
+    # An episode's is the mean over its own periods.
+    correction = sum(float(episode["mean_correction"]) * int(episode["steps"]) for episode in metrics)
     return json_safe(
         {
             "episodes": len(metrics),
@@ -245,6 +247,7 @@ def summarise(
             "min_obstacle_clearance": smallest("min_obstacle_clearance"),
             "intervention_rate": share("interventions"),
             "infeasible_rate": share("infeasible"),
+            "mean_correction": correction / steps if steps else None,
             **about,
         }
     )

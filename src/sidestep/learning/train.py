@@ -109,7 +109,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
 def train(
     scenario: Scenario,
     *,
-    shield: Any = "game",
+    shield: Any = "joint",
     pursuer: Any = "nash",
     seed: int = 0,
     episodes: int = 200,

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import sidestep
 from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
-from sidestep.safety import make_shield
+from sidestep.safety import Status, make_shield
 from sidestep.trials.captures import examine_captures
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import GOAL_SEEKING
@@ -19,13 +21,20 @@ from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_t
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
 PAPER: dict[str, Any] = {
-    "episodes": 200,
-    "safe_episodes": 200,
-    "converged_within": 80,
-    "converged_return": 1000.0,
-    "scene_outcome": "reached",
+    "training": {
+        "episodes": 200,
+        "safe_episodes": 200,
+        "captured": 0,
+        "collided": 0,
+        "converged_episode": 80,
+        "final_return": 1000.0,
+    },
+    "scene_trained": {"outcome": "reached"},
 }
-"""What the paper reports (section IV and its Table I)."""
+"""What the paper reports (section IV and its Table I), under the names of our own figures."""
+
+SHIELDS = ("none", "paper", "game", "joint")
+"""The shields that a study compares unless told otherwise: each adds to the one before it."""
 
 Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
 """Opens a progress display for a labelled part: a context manager that gives a callable."""
@@ -56,16 +65,17 @@ class ShieldStudy:
 
 def describe(trajectory: Trajectory) -> dict[str, Any]:
     """A recorded episode in a few figures: outcome, time (s), clearances (m), corrections (m/s)."""
-    events = trajectory.events
+    events, status = trajectory.events, np.asarray(trajectory.status)
     return records.json_safe(
         {
             "outcome": trajectory.outcome,
-            "seconds": float(trajectory.worlds.time[-1]),
+            # The clock of a long episode has gathered rounding; its first tick has not.
+            "seconds": round(trajectory.length * float(trajectory.worlds.time[1]), 4),
             "return": float(events.reward.sum()),
             "min_pursuer_clearance": float(events.pursuer_clearance.min()),
             "min_obstacle_clearance": float(events.obstacle_clearance.min()),
-            "intervention_rate": float((trajectory.status != 0).mean()),
-            "infeasible_rate": float((trajectory.status == 2).mean()),
+            "intervention_rate": float(np.mean(status != Status.OK)),
+            "infeasible_rate": float(np.mean(status == Status.INFEASIBLE)),
             "mean_correction": float(trajectory.intervention.mean()),
         }
     )
@@ -103,7 +113,7 @@ def reproduce(
     out: str | Path,
     *,
     scenario: Scenario | None = None,
-    shields: Sequence[str] = ("none", "paper", "game"),
+    shields: Sequence[str] = SHIELDS,
     pursuer: str = "nash",
     seed: int = 0,
     episodes: int = 200,
@@ -129,6 +139,7 @@ def reproduce(
         make_shield(shield, scenario)
     if not shields or len(set(shields)) != len(shields):
         raise ValueError(f"shields = {tuple(shields)!r}: name each shield once, and at least one")
+    scene = test_scene_of(scenario)
     out = Path(out)
     config = {
         "study": list(shields),
@@ -146,7 +157,6 @@ def reproduce(
     else:
         records.create_run(out, config)
 
-    scene = test_scene_of(scenario)
     evaluation_key = seed + 1_000_000
     studies = []
     for shield in shields:

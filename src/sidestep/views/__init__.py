@@ -2,6 +2,7 @@
 
 from sidestep.views.capture_figure import capture_figure
 from sidestep.views.certificate_figure import certificate_figure
+from sidestep.views.comparison import Section, comparison_sections, markdown_tables
 from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
@@ -12,9 +13,12 @@ __all__ = [
     "EVALUATION_FILE",
     "SCENE_FILE",
     "Run",
+    "Section",
     "capture_figure",
     "certificate_figure",
+    "comparison_sections",
     "load_run",
+    "markdown_tables",
     "outcome_figure",
     "reward_figure",
     "safety_rows",

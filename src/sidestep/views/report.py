@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 import sidestep
 from sidestep.learning.records import converged_episode, write_bytes
 from sidestep.pursuit import CaptureGame
+from sidestep.safety import Status
 from sidestep.trials import Capture, Trajectory, explain_capture
 from sidestep.views.capture_figure import capture_figure
 from sidestep.views.runs import Run, by_shield, load_run
@@ -25,6 +26,7 @@ from sidestep.views.training_figures import (
     reward_figure,
     safety_rows,
     safety_table,
+    shows_episodes,
 )
 from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
 from sidestep.world import Scenario
@@ -85,8 +87,11 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "pursuers": sorted({str(run.config.get("pursuer", "?")) for run in runs}),
         "seeds": sorted({run.seed for run in runs}),
         "cards": [_card(shield, group, scenes) for shield, group in groups.items()],
-        "comparison": _comparison(groups, scenes),
+        "comparison": _comparison(
+            groups, {shield: scene for shield, (_, scene) in scenes.items()}, untrained_scenes
+        ),
         "reward": _figure(reward_figure(runs, folder / "reward")),
+        "shows_episodes": shows_episodes(runs),
         "several_seeds": any(len(group) > 1 for group in groups.values()),
         "evaluations": evaluations,
         "untrained": untrained,
@@ -95,10 +100,13 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         )
         if untrained_scenes
         else None,
-        "outcomes": _figure(outcome_figure(evaluations, folder / "outcomes")) if evaluations else None,
+        "outcomes": _figure(outcome_figure(evaluations, folder / "outcomes", untrained))
+        if evaluations
+        else None,
         "scenes": [_scene(run.scenario, shield, scene, folder) for shield, (run, scene) in scenes.items()],
         "capture": _capture_section(groups, folder),
         "game": _game_numbers(scenario),
+        "joint": "joint" in groups,
         "configurations": [_configuration(run) for run in runs],
         "outcome_words": OUTCOME_WORDS,
         "shield_words": shield_words,
@@ -162,7 +170,9 @@ def _pooled(group: Sequence[Run], key: str) -> list[float]:
 
 
 def _comparison(
-    groups: Mapping[str, Sequence[Run]], scenes: Mapping[str, tuple[Run, Trajectory]]
+    groups: Mapping[str, Sequence[Run]],
+    scenes: Mapping[str, Trajectory],
+    untrained_scenes: Mapping[str, Trajectory],
 ) -> dict[str, Any]:
     """The paper's figures beside ours: names of the columns, and rows of cells."""
     safety = {row["shield"]: row for row in safety_rows([run for group in groups.values() for run in group])}
@@ -191,11 +201,22 @@ def _comparison(
         shares = [
             sum(_pooled(g, key)) / s if s else None for g, s in zip(groups.values(), steps, strict=True)
         ]
-        add(name, "not reported", [_percent(share) for share in shares])
+        add(name, "–", [_percent(share) for share in shares])
+    corrections = [
+        sum(float(e["mean_correction"]) * int(e["steps"]) for run in group for e in run.metrics) / periods
+        if periods
+        else None
+        for group, periods in zip(groups.values(), steps, strict=True)
+    ]
+    add("mean correction", "–", [_number(value, 4, " m/s") for value in corrections])
     closest = [min(_pooled(group, "min_pursuer_clearance"), default=None) for group in groups.values()]
-    add("closest to capture", "not reported", [_number(value, 4, " m") for value in closest])
-    ends = [OUTCOME_WORDS[scenes[shield][1].outcome] if shield in scenes else "not run" for shield in groups]
-    add("the paper's test scene", "reached the target", ends)
+    add("closest to capture", "–", [_number(value, 4, " m") for value in closest])
+    for policy, found, reported in (
+        ("learned policy", scenes, "reached the target"),
+        ("straight for the target", untrained_scenes, "–"),
+    ):
+        ends = [OUTCOME_WORDS[found[shield].outcome] if shield in found else "not run" for shield in groups]
+        add(f"test scene, {policy}", reported, ends)
     return {"columns": ["the paper reports", *(shield_words(shield) for shield in groups)], "rows": rows}
 
 
@@ -203,9 +224,10 @@ def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> 
     written = trajectory_figure(
         scenario, scene, folder / f"test-scene-{shield}", shield=shield, title="Paths, marked in seconds"
     )
-    corrected = float(np.mean(np.asarray(scene.intervention) > 1e-6)) if scene.length else 0.0
+    corrected = float(np.mean(np.asarray(scene.status) != Status.OK)) if scene.length else 0.0
     facts = [
-        f"The shield changed the velocity in {_percent(corrected)} of the control periods."
+        f"The shield changed the velocity in {_percent(corrected)} of the control periods, on average over "
+        f"all of them by {_number(float(np.mean(np.asarray(scene.intervention))), 4, ' m/s')}."
         if corrected
         else "The shield never changed the velocity."
     ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sidestep.learning.records import RunError, read_json, read_metrics, summarise
+from sidestep.safety.catalogue import SHIELDS
 from sidestep.trials import Trajectory, load_trajectory
 from sidestep.world import Scenario, load_scenario
 
@@ -90,7 +91,7 @@ def load_run(folder: str | Path) -> Run:
 
 def by_shield(runs: Iterable[Run]) -> dict[str, list[Run]]:
     """The runs of each shield, weakest shield first, then in the order given."""
-    order = ("none", "paper", "game", "joint")
+    order = list(SHIELDS)
     groups: dict[str, list[Run]] = {}
     for run in runs:
         groups.setdefault(run.shield, []).append(run)

@@ -180,6 +180,9 @@ def draw_time_marks(
 ) -> None:
     """The time in seconds, and a dot, at these control periods of a path; `side` -1 labels its right."""
     span = np.ptp(np.asarray([axes.get_xlim(), axes.get_ylim()]), axis=1).max()
+    place = axes.get_subplotspec()
+    # Labels keep their size when scenes stand side by side, so fewer have room.
+    room = 0.022 * span * (1 if place is None else place.get_gridspec().ncols)
     last = None
     for mark in periods:
         if mark >= len(path):
@@ -195,7 +198,7 @@ def draw_time_marks(
                 zorder=8,
             )
         # Where a robot stands still its labels would pile up.
-        if last is not None and np.hypot(*(path[mark] - last)) < 0.02 * span:
+        if last is not None and np.hypot(*(path[mark] - last)) < room:
             continue
         last = path[mark]
         ahead = path[min(mark + 1, len(path) - 1)] - path[max(mark - 1, 0)]

@@ -39,6 +39,12 @@ _SHIELD_WORDS = {
     "game": "game shield",
     "joint": "joint shield",
 }
+# Told apart without colour too: in print, and where two colours are equally light.
+_SHIELD_DASHES: dict[str, Any] = {
+    "none": (0, (1, 1.2)),
+    "paper": (0, (4, 1.5)),
+    "game": (0, (6, 1.5, 1, 1.5)),
+}
 _OTHERS = (PURPLE, SKY, VERMILION, BLACK)
 
 WIDTH = 7.0
@@ -87,6 +93,11 @@ _SETTINGS: dict[str, Any] = {
 def shield_colour(name: str, position: int = 0) -> str:
     """The colour of a shield everywhere; one that is not ours gets one of the others by its position."""
     return _SHIELD_COLOURS.get(name, _OTHERS[position % len(_OTHERS)])
+
+
+def shield_dashes(name: str) -> Any:
+    """The line style of a shield everywhere; solid for `joint` and for one that is not ours."""
+    return _SHIELD_DASHES.get(name, "solid")
 
 
 def shield_words(name: str) -> str:

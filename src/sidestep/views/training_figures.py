@@ -25,19 +25,22 @@ from sidestep.views.style import (
     panel_titles,
     save,
     shield_colour,
+    shield_dashes,
     shield_words,
 )
 
 PAPER_CONVERGED = 80
 PAPER_EPISODES = 200
 _MANY_RUNS = 6
+_MOST_SHIELDS_WITH_EPISODES = 2
 
 
 def reward_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
     """Accumulated reward over training episodes, and below it how every episode ended.
 
-    Faint: each episode; thick: mean of the last 20, and over several seeds the interquartile mean of it with
-    the range of the seeds. A diamond marks convergence (mean of 20 at least 940). Writes PNG and PDF.
+    Thick: mean of the last 20 episodes, and over several seeds the interquartile mean of it with the range of
+    the seeds; faint: each episode, for up to two shields (see `shows_episodes`). A diamond marks convergence
+    (mean of 20 at least 940). Writes PNG and PDF.
     """
     groups = by_shield(runs)
     rows = [run for group in groups.values() for run in group]
@@ -48,18 +51,29 @@ def reward_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         top, raster = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, raster_height])
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = shield_colour(shield, position), shield_words(shield)
-            _draw_returns(top, group, colour, words, line=len(groups) == 1)
+            kind = "line" if len(groups) == 1 else "dots" if shows_episodes(runs) else "none"
+            _draw_returns(top, group, colour, words, shield_dashes(shield), episodes_as=kind)
         panel_titles([top, raster], ["Accumulated reward per training episode", "How each episode ended"])
         _finish_returns(top, rows)
         _draw_outcomes(raster, rows)
         return save(figure, path)
 
 
+def shows_episodes(runs: Sequence[Run]) -> bool:
+    """Whether `reward_figure` shows each episode's return, or only means.
+
+    Returns are near 0 or near 1000, so those of more than two shields would cover each other.
+    """
+    return len(by_shield(runs)) <= _MOST_SHIELDS_WITH_EPISODES
+
+
 def _returns(run: Run) -> np.ndarray:
     return np.array([float(episode["return"]) for episode in run.metrics])
 
 
-def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, *, line: bool) -> None:
+def _draw_returns(
+    axes: Axes, group: Sequence[Run], colour: str, label: str, dashes: Any, *, episodes_as: str
+) -> None:
     curves = [_returns(run) for run in group]
     several = len(group) > 1
     label += f", {len(group)} seeds" if several else ""
@@ -67,10 +81,9 @@ def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, *, 
         episodes = np.arange(1, len(returns) + 1)
         if several:
             axes.plot(episodes, moving_mean(returns), color=colour, alpha=0.35, linewidth=0.7)
-        elif line:
+        elif episodes_as == "line":
             axes.plot(episodes, returns, color=colour, alpha=0.3, linewidth=0.7)
-        else:
-            # The lines of several shields would hide each other: returns jump between 0 and 1000.
+        elif episodes_as == "dots":
             axes.scatter(episodes, returns, s=7, color=colour, alpha=0.45, linewidth=0)
         closed = converged_episode(returns)
         if closed is not None:
@@ -82,7 +95,10 @@ def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, *, 
     means = np.stack([moving_mean(returns[:shortest]) for returns in curves])
     episodes = np.arange(1, shortest + 1)
     middle = np.array([interquartile_mean(column) for column in means.T])
-    axes.plot(episodes, middle, color=colour, linewidth=2.0, label=label, zorder=4)
+    axes.plot(
+        episodes, middle, color=colour, linewidth=2.0, linestyle=dashes, label=label, zorder=4,
+        dash_capstyle="butt",
+    )  # fmt: skip
     if several:
         axes.fill_between(
             episodes, means.min(axis=0), means.max(axis=0), color=colour, alpha=0.15, linewidth=0
@@ -228,10 +244,17 @@ def safety_table(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         return save(figure, path)
 
 
-def outcome_figure(evaluations: Mapping[str, Mapping[str, Any]], path: str | Path) -> tuple[Path, Path]:
+def outcome_figure(
+    evaluations: Mapping[str, Mapping[str, Any]],
+    path: str | Path,
+    untrained: Mapping[str, Mapping[str, Any]] | None = None,
+) -> tuple[Path, Path]:
     """Shares of episodes captured, collided, timed out and reached per shield, with 95 % Wilson intervals.
 
-    **Arguments:** `evaluations` what `Evaluation.to_dict` gives, by shield. Writes PNG and PDF.
+    Filled: the learned policy; hollow below it: the one that heads straight for the target, if given. What
+    differs between the two is the policy's work, what differs between rows the shield's.
+
+    **Arguments:** `evaluations`, `untrained` what `Evaluation.to_dict` gives, by shield. Writes PNG and PDF.
     """
     panels = (
         ("captured", "Captured"),
@@ -239,23 +262,23 @@ def outcome_figure(evaluations: Mapping[str, Mapping[str, Any]], path: str | Pat
         ("timed_out", "Timed out"),
         ("reached", "Reached"),
     )
-    names = list(evaluations)
+    untrained = untrained or {}
+    names = list(dict.fromkeys([*evaluations, *untrained]))
+    apart = 0.21 if untrained else 0.0
     with house_style():
-        figure = new_figure(WIDTH, 0.95 + 0.27 * len(names))
+        figure = new_figure(WIDTH, 0.95 + (0.46 if untrained else 0.27) * len(names))
         axes = figure.subplots(1, len(panels), sharey=True)
         for one, (outcome, title) in zip(axes, panels, strict=True):
             most = 1.0
             for row, name in enumerate(names):
-                report = evaluations[name]
-                rate, low, high = (100 * report[f"{outcome}_rate{end}"] for end in ("", "_low", "_high"))
                 colour = shield_colour(name, row)
-                one.plot([low, high], [row, row], color=colour, linewidth=2.2, alpha=0.5)
-                one.plot(rate, row, "o", color=colour, markersize=5)
-                one.annotate(
-                    f"{report[outcome]}", (rate, row), xytext=(0, 5), textcoords="offset points",
-                    ha="center", fontsize=6.5,
-                )  # fmt: skip
-                most = max(most, high)
+                for reports, place, face in (
+                    (evaluations, row - apart, colour),
+                    (untrained, row + apart, "white"),
+                ):
+                    if name in reports:
+                        high = _draw_share(one, reports[name], outcome, place, colour, face)
+                        most = max(most, high)
             one.set_xlim(-0.04 * most, 1.08 * most) if outcome != "reached" else None
             one.set_xlabel("% of episodes")
             one.set_title(title)
@@ -264,4 +287,27 @@ def outcome_figure(evaluations: Mapping[str, Mapping[str, Any]], path: str | Pat
             one.spines["left"].set_visible(False)
         axes[0].set_yticks(range(len(names)), [shield_words(name) for name in names])
         axes[0].set_ylim(len(names) - 0.5, -0.65)
+        if untrained:
+            handles = [
+                Line2D([], [], marker="o", linestyle="none", color=INK, markersize=5, label="learned policy"),
+                Line2D(
+                    [], [], marker="o", linestyle="none", color=INK, markerfacecolor="white", markersize=5,
+                    label="straight for the target, not learned",
+                ),
+            ]  # fmt: skip
+            figure.legend(handles=handles, loc="outside lower center", ncols=2)
         return save(figure, path)
+
+
+def _draw_share(
+    axes: Axes, report: Mapping[str, Any], outcome: str, place: float, colour: str, face: str
+) -> float:
+    """One share (%) with its interval and count; the upper end of the interval."""
+    rate, low, high = (100 * report[f"{outcome}_rate{end}"] for end in ("", "_low", "_high"))
+    axes.plot([low, high], [place, place], color=colour, linewidth=2.2, alpha=0.5)
+    axes.plot(rate, place, "o", color=colour, markerfacecolor=face, markersize=5)
+    axes.annotate(
+        f"{report[outcome]}", (rate, place), xytext=(0, 4), textcoords="offset points", ha="center",
+        fontsize=6.5,
+    )  # fmt: skip
+    return high

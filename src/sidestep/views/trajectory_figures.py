@@ -29,6 +29,7 @@ from sidestep.views.scene import (
     world_at,
 )
 from sidestep.views.style import (
+    BLUE,
     EVADER,
     INK,
     OBSTACLE,
@@ -59,7 +60,8 @@ def trajectory_figure(
     title: str | None = None,
     moment: float | None = None,
 ) -> tuple[Path, Path]:
-    """The paths of evader, pursuers and obstacles, and below them barriers and corrections over time.
+    """The paths of evader, pursuers and obstacles; below them the trace of the shield over time: barriers,
+    corrections, and its status in every control period.
 
     **Arguments:** `shield` the name of the shield used, for words and for which barrier's level sets are
     drawn; `moment` the time (s) at which pursuers' capture sets, obstacles and level sets are drawn: when it
@@ -75,26 +77,29 @@ def trajectory_figure(
         spans = high - low + 2 * _margin(scenario)
         # As high as the scene needs at full width, within reason.
         scene_height = float(np.clip((WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
-        figure = new_figure(WIDTH, scene_height + 3.3)
-        scene, key, barriers, corrections = figure.subplots(
-            4, 1, height_ratios=[scene_height + 0.4, 0.4, 1.3, 0.85]
+        figure = new_figure(WIDTH, scene_height + 3.75)
+        scene, key, barriers, corrections, answers = figure.subplots(
+            5, 1, height_ratios=[scene_height + 0.4, 0.4, 1.3, 0.85, 0.16]
         )
         norm = _correction_norm(scenario)
         draw_scene(scene, scenario, trajectory, norm, shield=shield, period=period)
         _scene_legend(key, trajectory)
         _draw_barriers(barriers, scenario, trajectory, period)
         _draw_corrections(corrections, scenario, trajectory, norm, period)
-        barriers.sharex(corrections)
-        barriers.tick_params(axis="x", labelbottom=False)
+        _draw_answers(answers, scenario, trajectory)
+        for upper in (barriers, corrections):
+            upper.sharex(answers)
+            upper.tick_params(axis="x", labelbottom=False)
         words = f"{shield_words(shield)}: " if shield else ""
         duration = trajectory.length * float(scenario.control_period)
-        heading = title or f"{words}{OUTCOME_WORDS[trajectory.outcome]} after {duration:.1f} s"
+        heading = title or f"{words}{OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
         panel_titles(
-            [scene, barriers, corrections],
+            [scene, barriers, corrections, answers],
             [
                 heading[:1].upper() + heading[1:],
                 "Barriers: how far from capture and collision",
                 "How far the shield changed the velocity (colours as above)",
+                "What the shield answered",
             ],
         )
         return save(figure, path)
@@ -103,7 +108,7 @@ def trajectory_figure(
 def scenes_figure(
     scenario: Scenario, trajectories: Mapping[str, Trajectory], path: str | Path
 ) -> tuple[Path, Path]:
-    """The same scene under several shields, one below the other. Writes PNG and PDF.
+    """The same scene under several shields, at one scale. Writes PNG and PDF.
 
     **Arguments:** `trajectories` by name of shield.
     """
@@ -113,19 +118,27 @@ def scenes_figure(
         low = np.min([extent[0] for extent in extents], axis=0)
         high = np.max([extent[1] for extent in extents], axis=0)
         spans = high - low + 2 * _margin(scenario)
-        height = float(np.clip((WIDTH - 1.3) * spans[1] / spans[0], 1.5, 4.0))
-        count = len(trajectories)
-        figure = new_figure(WIDTH, (height + 0.35) * count + 0.6)
-        *axes, key = figure.subplots(count + 1, 1, height_ratios=[height + 0.35] * count + [0.4])
+        # Two columns from three scenes on: one below the other they would not fit a page.
+        count, columns = len(trajectories), 1 if len(trajectories) <= 2 else 2
+        rows = -(-count // columns)
+        height = float(np.clip((WIDTH - 1.3) / columns * spans[1] / spans[0], 1.5, 4.0))
+        figure = new_figure(WIDTH, (height + 0.35) * rows + 0.6)
+        grid = figure.add_gridspec(rows + 1, columns, height_ratios=[height + 0.35] * rows + [0.4])
+        axes = [figure.add_subplot(grid[divmod(index, columns)]) for index in range(count)]
+        key = figure.add_subplot(grid[rows, :])
         titles = []
         for one, (shield, trajectory) in zip(axes, trajectories.items(), strict=True):
             draw_scene(one, scenario, trajectory, norm, shield=shield, limits=(low, high))
             duration = trajectory.length * float(scenario.control_period)
-            words = f"{shield_words(shield)}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.1f} s"
+            words = f"{shield_words(shield)}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
             titles.append(words[:1].upper() + words[1:])
-        for one in axes[:-1]:
-            one.set_xlabel("")
-            one.tick_params(labelbottom=False)
+        for index, one in enumerate(axes):
+            if index + columns < count:
+                one.set_xlabel("")
+                one.tick_params(labelbottom=False)
+            if index % columns:
+                one.set_ylabel("")
+                one.tick_params(labelleft=False)
         _scene_legend(key, next(iter(trajectories.values())))
         bar = figure.colorbar(
             ScalarMappable(norm, correction_colours()), ax=[*axes, key], shrink=0.4, aspect=25, pad=0.015
@@ -233,15 +246,17 @@ def _times(scenario: Scenario, trajectory: Trajectory) -> np.ndarray:
     return np.arange(trajectory.length) * float(scenario.control_period)
 
 
+def _stretches(scenario: Scenario, flags: np.ndarray) -> list[tuple[float, float]]:
+    """Begin and duration (s) of every uninterrupted stretch of control periods for which the flag is set."""
+    length = float(scenario.control_period)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int))).reshape(-1, 2)
+    return [(float(begin) * length, float(end - begin) * length) for begin, end in edges]
+
+
 def _shade_infeasible(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
     """Background where the shield could not satisfy its rows."""
-    times, length = _times(scenario, trajectory), float(scenario.control_period)
-    stuck = np.asarray(trajectory.status) == Status.INFEASIBLE
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(int)))
-    for begin, end in edges.reshape(-1, 2):
-        axes.axvspan(
-            float(times[begin]), float(times[end - 1]) + length, color=PURSUER, alpha=0.18, linewidth=0
-        )
+    for begin, duration in _stretches(scenario, np.asarray(trajectory.status) == Status.INFEASIBLE):
+        axes.axvspan(begin, begin + duration, color=PURSUER, alpha=0.18, linewidth=0)
 
 
 def _draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory, period: int) -> None:
@@ -296,15 +311,36 @@ def _draw_corrections(
     axes.step(times, correction, where="post", color=INK, linewidth=0.5)
     axes.axvline(period * length, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.set_ylim(0.0, 2.1 * float(scenario.evader_speed))
-    axes.set_xlim(0.0, max(trajectory.length, 1) * length)
     axes.set_ylabel("m/s")
-    axes.set_xlabel("time, s")
-    if np.any(np.asarray(trajectory.status) == Status.INFEASIBLE):
-        axes.legend(
-            handles=[Patch(facecolor=PURSUER, alpha=0.25, label="no velocity satisfies all rows")],
-            loc="upper left", frameon=True, framealpha=0.85, edgecolor="none", borderpad=0.2,
-        )  # fmt: skip
     if np.max(correction, initial=0.0) <= 1e-6:
         axes.text(
             0.5, 0.45, "it never did", transform=axes.transAxes, ha="center", va="center", color="#777777"
         )
+
+
+_ANSWERS = {
+    Status.OK: ("#DDDDDD", "the policy's velocity"),
+    Status.CORRECTED: (BLUE, "corrected"),
+    Status.INFEASIBLE: (PURSUER, "no velocity satisfies all rows"),
+    Status.INVALID: (INK, "unknown world or velocity"),
+}
+
+
+def _draw_answers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
+    """The status of every control period as a strip, with a key of those that occur and how often."""
+    status, handles = np.asarray(trajectory.status), []
+    for value, (colour, words) in _ANSWERS.items():
+        share = float(np.mean(status == value)) if len(status) else 0.0
+        if share:
+            # A bar per stretch, not per period: thousands of hairlines would not print.
+            axes.broken_barh(_stretches(scenario, status == value), (0.0, 1.0), facecolor=colour, linewidth=0)
+            handles.append(Patch(facecolor=colour, label=f"{words}, {100 * share:.1f} %"))
+    axes.set_ylim(0.0, 1.0)
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+    axes.set_xlim(0.0, max(trajectory.length, 1) * float(scenario.control_period))
+    axes.set_xlabel("time, s")
+    axes.legend(
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderpad=0.1,
+        borderaxespad=0.3, columnspacing=1.2, handlelength=1.0,
+    )  # fmt: skip
