@@ -99,7 +99,7 @@ def trajectory_figure(
                 heading[:1].upper() + heading[1:],
                 "Barriers: how far from capture and collision",
                 "How far the shield changed the velocity (colours as above)",
-                "What the shield answered",
+                "Answer",
             ],
         )
         return save(figure, path)
@@ -130,7 +130,8 @@ def scenes_figure(
         for one, (shield, trajectory) in zip(axes, trajectories.items(), strict=True):
             draw_scene(one, scenario, trajectory, norm, shield=shield, limits=(low, high))
             duration = trajectory.length * float(scenario.control_period)
-            words = f"{shield_words(shield)}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
+            # Short, for half a page's width.
+            words = f"{shield_words(shield)}: {trajectory.outcome.replace('_', ' ')}, {duration:.2f} s"
             titles.append(words[:1].upper() + words[1:])
         for index, one in enumerate(axes):
             if index + columns < count:
@@ -319,10 +320,10 @@ def _draw_corrections(
 
 
 _ANSWERS = {
-    Status.OK: ("#DDDDDD", "the policy's velocity"),
+    Status.OK: ("#DDDDDD", "unchanged"),
     Status.CORRECTED: (BLUE, "corrected"),
-    Status.INFEASIBLE: (PURSUER, "no velocity satisfies all rows"),
-    Status.INVALID: (INK, "unknown world or velocity"),
+    Status.INFEASIBLE: (PURSUER, "not all rows can hold"),
+    Status.INVALID: (INK, "invalid input"),
 }
 
 
@@ -342,5 +343,5 @@ def _draw_answers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
     axes.set_xlabel("time, s")
     axes.legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderpad=0.1,
-        borderaxespad=0.3, columnspacing=1.2, handlelength=1.0,
+        borderaxespad=0.3, columnspacing=1.1, handlelength=0.9, handletextpad=0.5, fontsize=7,
     )  # fmt: skip
