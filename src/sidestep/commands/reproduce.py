@@ -83,6 +83,7 @@ def run(command: Reproduce, console: Console) -> int:
         return 130
     summary = read_summary(command.out)
     sections = comparison_sections(summary)
+    console.print("Columns: what the paper reports, then our measurements under each shield.\n")
     for table in comparison_tables(sections):
         console.print(table)
         console.print()
