@@ -12,6 +12,7 @@ from sidestep.learning.networks import Actor, TwinCritic
 from sidestep.learning.replay import mirror_world
 from sidestep.learning.td3 import actor_loss
 from sidestep.safety import as_shield
+from sidestep.safety.joint import JointShield
 from sidestep.world import World, load_scenario, observation_size, observe
 
 KEY = jax.random.key(0)
@@ -133,7 +134,7 @@ def test_actor_gradient_through_the_filter_is_the_slope_of_the_actor_loss(x64):
 def test_joint_is_learned_through_by_its_rows_alone():
     """An imagined chase for every world of every batch would cost more than the whole training."""
     scenario = load_scenario("paper")
-    joint = as_shield("joint", scenario)
+    joint = JointShield(scenario)
     rows = as_shield("game", eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain))
     worlds, actions = crowded_worlds(2, 6), actions_of(2, 7)
     ours, theirs = (
