@@ -11,7 +11,7 @@ from sidestep.learning.bounds import on_disc, through_shield
 from sidestep.learning.networks import Actor, TwinCritic
 from sidestep.learning.replay import mirror_world
 from sidestep.learning.td3 import actor_loss
-from sidestep.safety import as_shield
+from sidestep.safety import GameShield, as_shield
 from sidestep.safety.joint import JointShield
 from sidestep.world import World, load_scenario, observation_size, observe
 
@@ -135,7 +135,8 @@ def test_joint_is_learned_through_by_its_rows_alone():
     """An imagined chase for every world of every batch would cost more than the whole training."""
     scenario = load_scenario("paper")
     joint = JointShield(scenario)
-    rows = as_shield("game", eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain))
+    faster = eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain)
+    rows = GameShield(faster, wish_picks_side=True)
     worlds, actions = crowded_worlds(2, 6), actions_of(2, 7)
     ours, theirs = (
         jax.make_jaxpr(lambda w, a, s=shield: through_shield(scenario, s, w)(a, KEY))(worlds, actions)

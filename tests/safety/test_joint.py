@@ -13,7 +13,7 @@ from sidestep.trials.keys import episode_key, start_and_pursuit
 from sidestep.world import World, load_scenario
 
 # Of the first 300 random starts from key 7, some in which `game` collides while heading for the target.
-LOST_BY_GAME = (153, 224, 242)
+LOST_BY_GAME = (224, 242)
 
 
 def _starts(scenario, numbers):
@@ -64,7 +64,7 @@ def test_an_imagined_chase_is_the_chase_that_follows():
     scenario = load_scenario("paper", obstacle_count=2)
     names = ("pure-pursuit", "interceptor")
     models = tuple(make_pursuer(name) for name in names)
-    guard = GameShield(scenario)
+    guard = GameShield(scenario, wish_picks_side=True)
     world = scenario.reset(jax.random.key(4))
     ways = jnp.array([[0, 5, 16, 18], [17, 17, 3, 19]], jnp.int32)
     ages, length, periods = jnp.array([0.0, 0.2]), jnp.asarray(0.5), jnp.full(30, scenario.control_period)
@@ -72,10 +72,10 @@ def test_an_imagined_chase_is_the_chase_that_follows():
     @jax.jit
     def both(world):
         sides = guard.init(world)
-        spread = lambda leaf: jnp.broadcast_to(leaf, (2, 2, *leaf.shape))  # noqa: E731
+        spread = lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, 2, 2))  # noqa: E731
         outlook = imagine(
-            scenario, guard, models, jax.tree.map(spread, world), spread(sides), ways, ages, periods, length,
-            jnp.asarray(0.0),
+            scenario, guard.heed, models, jax.tree.map(spread, world), spread(sides), ways, ages, periods,
+            length, jnp.asarray(0.0),
         )  # fmt: skip
 
         def follow(model, way, age):
@@ -112,11 +112,8 @@ def test_the_time_to_contact_counts_until_the_first_touch():
     world = World(
         jnp.zeros(2), jnp.array([[30.0, 0.0, 0.0]]), jnp.array([[0.5, 0.0, 0.0, 0.0]]), jnp.array([2.0, 0.0])
     )
-    free = lambda world, wished, sides: (  # noqa: E731
-        eqx.tree_at(lambda r: r.action, GameShield(scenario)(world, wished, sides)[0], wished),
-        sides,
-    )
-    spread = lambda leaf: jnp.broadcast_to(leaf, (1, 1, *leaf.shape))  # noqa: E731
+    free = lambda world, wished, sides: (wished, sides)  # noqa: E731
+    spread = lambda leaf: leaf[..., None, None]  # noqa: E731
     outlook = jax.jit(
         lambda world: imagine(
             scenario, free, (make_pursuer("still"),), jax.tree.map(spread, world), spread(jnp.ones(1)),
@@ -190,10 +187,11 @@ def test_far_away_and_without_obstacles_it_is_the_game_shield():
             "paper", obstacle_count=count, **({} if obstacle is None else {"obstacle_starts": obstacle})
         )
         joint = JointShield(scenario, models=("turn-then-drive",))
-        game = GameShield(eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain))
+        faster = eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain)
+        game = GameShield(faster, wish_picks_side=True)
         world = World(
             jnp.zeros(2),
-            jnp.array([[0.3, 0.05, 3.0]]),
+            jnp.array([[0.27, 0.02, 3.0]]),
             jnp.array([[5.0, 5.0, 0.0, 0.0]])[:count],
             jnp.array([1.0, 0.0]),
         )
@@ -224,3 +222,26 @@ def test_a_pursuer_that_drives_as_a_model_does_is_recognised():
     surprise = dict(zip(shield.models, np.asarray(memory.surprise), strict=True))
     assert surprise["turn-while-driving"] < 1e-3
     assert surprise["turn-then-drive"] > 0.1
+
+
+def test_close_to_the_axis_the_wish_picks_the_side_and_farther_off_it_does_not():
+    """Without that a pursuer that keeps turning after the evader leads it round to one side for ever."""
+    scenario = load_scenario("paper", pursuer_gain=4.0)
+    barrier = PursuitBarrier()
+    pick = jax.jit(
+        lambda place, wish, side: barrier.prefer(
+            scenario, World(place, jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.zeros(2)), side[None], wish
+        )[0]
+    )
+    left, right = jnp.array([0.05, 0.1]), jnp.array([0.05, -0.1])
+    for side in (jnp.ones(()), -jnp.ones(())):
+        near = jnp.array([0.27, 0.004])
+        assert pick(near, left, side) == 1.0
+        assert pick(near, right, side) == -1.0
+        # Straight on decides nothing.
+        assert pick(near, jnp.array([0.15, 0.001]), side) == barrier.recall(
+            scenario, near, jnp.zeros(3), side
+        )
+        # At the tip of the capture set, or far to one side, only the evader's own side can be kept.
+        assert pick(jnp.array([0.2542, 0.004]), right, side) == 1.0
+        assert pick(jnp.array([0.27, 0.06]), right, side) == 1.0

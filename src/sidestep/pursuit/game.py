@@ -17,18 +17,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, real, stack
 from sidestep.pursuit.time_optimal import Play, time_optimal_play
 from sidestep.world.capture_geometry import capture_set_distance, usable_angle
 from sidestep.world.scenario import Scenario
 
 
-def _sign(value: Float[AnyArray, ""]) -> Scalar:
+def _sign(value: Float[AnyArray, "*lanes"]) -> Lanes:
     """+1 or -1, and +1 at 0: a side must be chosen there too."""
     return jnp.where(jnp.asarray(value) < 0.0, -1.0, 1.0).astype(jnp.asarray(value).dtype)
 
 
-def turning_moment(z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
+def turning_moment(z: Float[AnyArray, "2 *lanes"], normal: Float[AnyArray, "2 *lanes"]) -> Lanes:
     """sigma = n_x z_y - n_y z_x (m): the moment of n about the pursuer; turning adds omega sigma to n.z'."""
     return normal[0] * z[1] - normal[1] * z[0]
 
@@ -82,8 +82,8 @@ class CaptureGame(eqx.Module):
         )
 
     def barrier(
-        self, z: Float[AnyArray, "2"], side: Float[AnyArray, ""] | float | None = None
-    ) -> tuple[Scalar, Float[Array, "2"]]:
+        self, z: Float[AnyArray, "2 *lanes"], side: Float[AnyArray, "*lanes"] | float | None = None
+    ) -> tuple[Lanes, Float[Array, "2 *lanes"]]:
         """Signed distance h (m) from the capture set and its unit normal n, in the pursuer's frame.
 
         h = r cos((S - beta')+) - l, with beta' the angle between z and the pursuer's axis, front or rear.
@@ -101,24 +101,26 @@ class CaptureGame(eqx.Module):
         own_side = _sign(z[1])
         chosen = own_side if side is None else _sign(real(side))
         in_front = jnp.abs(z[1]) * cosine < jnp.abs(z[0]) * sine
-        squared = jnp.sum(z**2)
+        squared = z[0] * z[0] + z[1] * z[1]
         apart = squared > 0.0
         # At the pursuer's very centre the tangent's direction, a limit from in front, is as good as any.
-        away = z / jnp.sqrt(jnp.where(apart, squared, 1.0))
-        tangent = jnp.stack([_sign(z[0]) * cosine, chosen * sine])
-        normal = jnp.where(in_front | ~apart, tangent, away)
+        distance = jnp.sqrt(jnp.where(apart, squared, 1.0))
+        tangent = _sign(z[0]) * cosine, chosen * sine
+        on_tangent = in_front | ~apart
+        normal = [jnp.where(on_tangent, tangent[i], z[i] / distance) for i in (0, 1)]
         value = capture_set_distance(z, usable, self.capture_distance)
         other_tangent = in_front & (chosen != own_side)
-        return jnp.where(other_tangent, jnp.sum(tangent * z) - self.capture_distance, value), normal
+        along = tangent[0] * z[0] + tangent[1] * z[1]
+        return jnp.where(other_tangent, along - self.capture_distance, value), stack(*normal)
 
-    def _turning_gain(self, z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
+    def _turning_gain(self, z: Float[AnyArray, "2 *lanes"], normal: Float[AnyArray, "2 *lanes"]) -> Lanes:
         """|sigma|/b; infinite for a pursuer that turns at no cost, unless turning gains nothing."""
         moment = jnp.abs(turning_moment(z, normal))
         axle = self.half_axle
         free = jnp.where(moment > 0.0, jnp.inf, 0.0)
         return jnp.where(axle > 0.0, moment / jnp.where(axle > 0.0, axle, 1.0), free)
 
-    def pursuit_rate(self, z: Float[AnyArray, "2"], normal: Float[AnyArray, "2"]) -> Scalar:
+    def pursuit_rate(self, z: Float[AnyArray, "2 *lanes"], normal: Float[AnyArray, "2 *lanes"]) -> Lanes:
         """V max(|n_x|, |sigma|/b), m/s: the fastest the pursuer can lower n.z on its own.
 
         The evader that moves with n.u >= pursuit_rate loses no ground against any admissible wheel speeds.

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import Scalar, real
+from sidestep._arrays import Lanes, Scalar, lane_by_lane, real, stack
 from sidestep.pursuit.game import CaptureGame
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -30,17 +30,17 @@ class Pursuer(eqx.Module):
     """
 
     @abc.abstractmethod
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         """Wanted wheel rim speeds (left, right; m/s) of `world.pursuer` for the next control period."""
 
-    def __call__(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def __call__(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         """Wheel rim speeds (left, right; m/s) of `world.pursuer`, each within [-V, V]."""
         return limit_wheels(self.steer(scenario, world, key), scenario.pursuer_speed)
 
 
 def _toward(
-    scenario: Scenario, turn: Scalar, end: Scalar | float = 1.0, turning_share: float = 1.0
-) -> Float[Array, "2"]:
+    scenario: Scenario, turn: Lanes, end: Lanes | float = 1.0, turning_share: float = 1.0
+) -> Float[Array, "2 *lanes"]:
     return turn_and_drive(
         turn,
         real(end),
@@ -62,14 +62,14 @@ class Nash(Pursuer):
     Beside the usable part, where driving on would only pass the evader by, it turns again.
     """
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(world.evader, world.pursuer)
         # The condition is the scenario's, not the world's, so a batch of worlds takes one branch only.
         return jax.lax.cond(
             game.evader_can_escape,
             lambda: _approach(scenario, game, z),
-            lambda: _hasten(game, z, scenario.control_period),
+            lambda: lane_by_lane(lambda z: _hasten(game, z, scenario.control_period), z),
         )
 
 
@@ -90,7 +90,7 @@ def _hasten(game: CaptureGame, z: Float[Array, "2"], period: Scalar) -> Float[Ar
     return game.pursuer_speed * jnp.stack([straight - turn, straight + turn])
 
 
-def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2"]) -> Float[Array, "2"]:
+def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
     """The law for the smallest distance: face or back onto the evader, come close, and strike.
 
     It strikes inside the capture set too, where driving straight on is also what captures soonest.
@@ -100,7 +100,7 @@ def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2"]) -> Fl
     reach = scenario.pursuer_speed * scenario.control_period
     strikes_from = game.largest_capture_distance - game.capture_distance + reach
     strike = (game.barrier(z)[0] <= strikes_from) & (jnp.abs(turn) <= game.usable_angle)
-    straight = jnp.full(2, end * game.pursuer_speed)
+    straight = stack(end, end) * game.pursuer_speed
     return jnp.where(strike, straight, _toward(scenario, turn, end))
 
 
@@ -108,7 +108,7 @@ def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2"]) -> Fl
 class TurnThenDrive(Pursuer):
     """Turns in place until it faces the evader, then drives straight at it, correcting as it goes."""
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         return _toward(scenario, bearing_of(to_pursuer_frame(world.evader, world.pursuer)))
 
 
@@ -116,7 +116,7 @@ class TurnThenDrive(Pursuer):
 class TurnWhileDriving(Pursuer):
     """Never stops driving forward: turns toward the evader on arcs no tighter than about its inner wheel."""
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         bearing = bearing_of(to_pursuer_frame(world.evader, world.pursuer))
         return _toward(scenario, bearing, turning_share=0.5)
 
@@ -129,11 +129,11 @@ class PurePursuit(Pursuer):
     Pursuit Path Tracking Algorithm", CMU-RI-TR-92-01, 1992).
     """
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         z = to_pursuer_frame(world.evader, world.pursuer)
         axle = scenario.pursuer_half_axle
         # v = V/(1 + b|curvature|) and omega = curvature v, written without the division by |z|^2.
-        squared = jnp.sum(z**2)
+        squared = z[0] * z[0] + z[1] * z[1]
         total = squared + 2.0 * axle * jnp.abs(z[1])
         apart = total > 0.0
         scale = scenario.pursuer_speed / jnp.where(apart, total, 1.0) * jnp.where(z[0] < 0.0, -1.0, 1.0)
@@ -148,14 +148,16 @@ class Interceptor(Pursuer):
     it; a few fixed-point steps find it. Against an evader too fast to be met it aims far ahead.
     """
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         z = to_pursuer_frame(world.evader, world.pursuer)
         ahead = to_pursuer_frame(world.evader + world.evader_velocity, world.pursuer) - z
         time = jnp.zeros_like(z[0])
         for _ in range(_INTERCEPT_STEPS):
             point = z + ahead * time
             _, turn = nearer_end(bearing_of(point))
-            distance = jnp.sqrt(jnp.maximum(jnp.sum(point**2), jnp.finfo(point.dtype).tiny))
+            distance = jnp.sqrt(
+                jnp.maximum(point[0] * point[0] + point[1] * point[1], jnp.finfo(point.dtype).tiny)
+            )
             driving = jnp.maximum(distance - scenario.capture_distance, 0.0)
             time = (driving + scenario.pursuer_half_axle * jnp.abs(turn)) / scenario.pursuer_speed
         end, turn = nearer_end(bearing_of(z + ahead * time))
@@ -166,7 +168,7 @@ class Interceptor(Pursuer):
 class Random(Pursuer):
     """Wheel speeds drawn uniformly from [-V, V], independently at each control period."""
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         speed = scenario.pursuer_speed
         return speed * jax.random.uniform(key, (2,), dtype=speed.dtype, minval=-1.0, maxval=1.0)
 
@@ -175,7 +177,7 @@ class Random(Pursuer):
 class Still(Pursuer):
     """Never moves."""
 
-    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         return jnp.zeros_like(world.pursuer[:2])
 
 
@@ -200,7 +202,7 @@ def make_pursuer(name: str) -> Pursuer:
 
 def pursue(
     scenario: Scenario, pursuer: Callable[..., Any], world: World, key: PRNGKeyArray
-) -> Float[Array, "m 2"]:
+) -> Float[Array, "m 2 *lanes"]:
     """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
 
     A strategy with a method `steer_all(scenario, world) -> (m, 2)` is asked for all of them at once instead.
@@ -214,7 +216,7 @@ def pursue(
     answers = []
     for index in range(scenario.pursuer_count):
         wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
-        if wheels.shape != (2,):
+        if wheels.shape != world.evader.shape:
             raise ValueError(
                 f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
             )

@@ -3,17 +3,17 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Scalar
+from sidestep._arrays import AnyArray, Lanes
 from sidestep.world.robots import wheels_from_body
 
 
-def bearing_of(z: Float[AnyArray, "2"]) -> Scalar:
+def bearing_of(z: Float[AnyArray, "2 *lanes"]) -> Lanes:
     """Direction (rad) of z, in [-pi, pi]; 0 at the origin, with a finite derivative there."""
-    apart = jnp.any(z != 0.0)
+    apart = (z[0] != 0.0) | (z[1] != 0.0)
     return jnp.arctan2(jnp.where(apart, z[1], 0.0), jnp.where(apart, z[0], 1.0))
 
 
-def nearer_end(bearing: Float[AnyArray, ""]) -> tuple[Scalar, Scalar]:
+def nearer_end(bearing: Float[AnyArray, "*lanes"]) -> tuple[Lanes, Lanes]:
     """Which end points at `bearing` sooner, +1 front or -1 rear, and the turn (rad) that brings it there."""
     behind = jnp.abs(bearing) > jnp.pi / 2.0
     turn = jnp.where(behind, bearing - jnp.where(bearing < 0.0, -jnp.pi, jnp.pi), bearing)
@@ -21,13 +21,13 @@ def nearer_end(bearing: Float[AnyArray, ""]) -> tuple[Scalar, Scalar]:
 
 
 def turn_and_drive(
-    turn: Float[AnyArray, ""],
-    end: Float[AnyArray, ""],
+    turn: Float[AnyArray, "*lanes"],
+    end: Float[AnyArray, "..."],
     rim_speed: Float[AnyArray, ""],
     half_axle: Float[AnyArray, ""],
     period: Float[AnyArray, ""],
     turning_share: float = 1.0,
-) -> Float[Array, "2"]:
+) -> Float[Array, "2 *lanes"]:
     """Turn by `turn` (rad) and drive with what is left of the wheels; `end` +1 drives forward, -1 backward.
 
     Within one control period the turn is exact when it can be: turning on at full speed past the wanted

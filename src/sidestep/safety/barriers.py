@@ -10,9 +10,9 @@ from typing import Any, TypeAlias, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep._arrays import AnyArray, Lanes, Scalar, real, stack
 from sidestep.pursuit.game import CaptureGame, turning_moment
 from sidestep.world.capture_geometry import to_pursuer_frame
 from sidestep.world.robots import body_velocity, drive
@@ -22,21 +22,22 @@ from sidestep.world.state import World
 _KEEP_SIDE = 0.5
 _STEEPER = 1.5
 _LOST_SIDE = 0.005
+_DECIDED = 0.1
 
-_NormalAndRate: TypeAlias = tuple[Float[Array, "2"], Scalar]
+_NormalAndRate: TypeAlias = tuple[Float[Array, "2 *lanes"], Float[Array, "*lanes"]]
 
 
 class BarrierRows(eqx.Module):
     """Values h (m) and rows n.u >= c of n barriers, n.u in m/s."""
 
-    values: Float[Array, "n"]
-    normals: Float[Array, "n 2"]
-    offsets: Float[Array, "n"]
+    values: Float[Array, "n *lanes"]
+    normals: Float[Array, "n 2 *lanes"]
+    offsets: Float[Array, "n *lanes"]
 
     @property
-    def value(self) -> Scalar:
+    def value(self) -> Lanes:
         """The composed barrier: the least of all, +inf when there is none."""
-        return jnp.min(self.values, initial=jnp.inf)
+        return jnp.min(self.values, axis=0, initial=jnp.inf)
 
 
 def compose(*rows: BarrierRows) -> BarrierRows:
@@ -64,74 +65,81 @@ class Barrier(eqx.Module):
     """
 
     @abc.abstractmethod
-    def robots(self, world: World) -> Float[Array, "n d"]:
+    def robots(self, world: World) -> Float[Array, "n d *lanes"]:
         """The robots this barrier is kept towards, as the world holds them."""
 
     @abc.abstractmethod
     def value(
         self,
         scenario: Scenario,
-        evader: Float[AnyArray, "2"],
-        robot: Float[AnyArray, "d"],
-        memory: Float[AnyArray, ""],
-    ) -> Scalar:
+        evader: Float[AnyArray, "2 *lanes"],
+        robot: Float[AnyArray, "d *lanes"],
+        memory: Float[AnyArray, "*lanes"],
+    ) -> Lanes:
         """h (m) of one evader position (m) towards one robot."""
 
     @abc.abstractmethod
     def approach(
         self,
         scenario: Scenario,
-        evader: Float[AnyArray, "2"],
-        robot: Float[AnyArray, "d"],
-        memory: Float[AnyArray, ""],
-    ) -> tuple[Float[Array, "2"], Scalar]:
+        evader: Float[AnyArray, "2 *lanes"],
+        robot: Float[AnyArray, "d *lanes"],
+        memory: Float[AnyArray, "*lanes"],
+    ) -> tuple[Float[Array, "2 *lanes"], Lanes]:
         """Unit normal n = dh/dp_e in world axes, and the rate (m/s) at which the robot lowers h."""
 
     @abc.abstractmethod
-    def allowance(self, scenario: Scenario, h: Float[AnyArray, ""]) -> Scalar:
+    def allowance(self, scenario: Scenario, h: Float[AnyArray, "*lanes"]) -> Lanes:
         """alpha(h) (m/s), increasing, alpha(0) = 0: how fast h may shrink."""
 
     @abc.abstractmethod
     def recall(
         self,
         scenario: Scenario,
-        evader: Float[AnyArray, "2"],
-        robot: Float[AnyArray, "d"],
-        memory: Float[AnyArray, ""] | None,
-    ) -> Scalar:
+        evader: Float[AnyArray, "2 *lanes"],
+        robot: Float[AnyArray, "d *lanes"],
+        memory: Float[AnyArray, "*lanes"] | None,
+    ) -> Lanes:
         """The memory to use now, given the one of the step before, or none at the start."""
 
     def row(
         self,
         scenario: Scenario,
-        evader: Float[AnyArray, "2"],
-        robot: Float[AnyArray, "d"],
-        memory: Float[AnyArray, ""],
-    ) -> tuple[Scalar, Float[Array, "2"], Scalar]:
+        evader: Float[AnyArray, "2 *lanes"],
+        robot: Float[AnyArray, "d *lanes"],
+        memory: Float[AnyArray, "*lanes"],
+    ) -> tuple[Lanes, Float[Array, "2 *lanes"], Lanes]:
         """h (m), and normal n and offset c (m/s) of the row n.u >= c, towards one robot."""
         h = self.value(scenario, evader, robot, memory)
         normal, rate = self.approach(scenario, evader, robot, memory)
         return h, normal, rate - self.allowance(scenario, h)
 
-    def rows(self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"]) -> BarrierRows:
+    def rows(self, scenario: Scenario, world: World, memory: Float[AnyArray, "n *lanes"]) -> BarrierRows:
         """Value and row towards every robot; `memory` as `remember` returned it for this world."""
         row = jax.vmap(self.row, in_axes=(None, None, 0, 0))
         return BarrierRows(*row(scenario, world.evader, self.robots(world), memory))
 
     def remember(
-        self, scenario: Scenario, world: World, memory: Float[AnyArray, "n"] | None = None
-    ) -> Float[Array, "n"]:
+        self, scenario: Scenario, world: World, memory: Float[AnyArray, "n *lanes"] | None = None
+    ) -> Float[Array, "n *lanes"]:
         """`recall` for every robot."""
         recall = jax.vmap(self.recall, in_axes=(None, None, 0, None if memory is None else 0))
         return recall(scenario, world.evader, self.robots(world), memory)
 
 
-def _away(offset: Float[Array, "2"]) -> tuple[Scalar, Float[Array, "2"]]:
-    """Distance and unit direction; at distance 0, where every direction is as good, +x."""
-    squared = jnp.sum(offset**2)
+def _away(
+    evader: Float[AnyArray, "2 *lanes"], robot: Float[AnyArray, "d *lanes"]
+) -> tuple[Lanes, Lanes, Lanes]:
+    """Distance, and unit direction from the robot; at distance 0, where every direction is as good, +x."""
+    x, y = evader[0] - robot[0], evader[1] - robot[1]
+    squared = x * x + y * y
     apart = squared > 0.0
-    norm = jnp.sqrt(jnp.where(apart, squared, 1.0))
-    return jnp.where(apart, norm, 0.0), jnp.where(apart, offset / norm, jnp.array([1.0, 0.0], offset.dtype))
+    distance = jnp.sqrt(jnp.where(apart, squared, 1.0))
+    return (
+        jnp.where(apart, distance, 0.0),
+        jnp.where(apart, x / distance, 1.0),
+        jnp.where(apart, y / distance, 0.0),
+    )
 
 
 @final
@@ -141,20 +149,20 @@ class ObstacleBarrier(Barrier):
     h = |p_e - p_c| - d_oc,  n = (p_e - p_c)/|p_e - p_c|,  c = n.v_c - gamma_oc h.
     """
 
-    def robots(self, world: World) -> Float[Array, "n 4"]:
+    def robots(self, world: World) -> Float[Array, "n 4 *lanes"]:
         return world.obstacles
 
-    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
-        return _away(evader - robot[:2])[0] - scenario.collision_distance
+    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
+        return _away(evader, robot)[0] - scenario.collision_distance
 
     def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
-        normal = _away(evader - robot[:2])[1]
-        return normal, jnp.sum(normal * robot[2:])
+        _, x, y = _away(evader, robot)
+        return stack(x, y), x * robot[2] + y * robot[3]
 
-    def allowance(self, scenario: Scenario, h: Any) -> Scalar:
+    def allowance(self, scenario: Scenario, h: Any) -> Lanes:
         return scenario.obstacle_gain * h
 
-    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return jnp.zeros_like(real(evader)[0])
 
 
@@ -169,21 +177,21 @@ class RangeBarrier(Barrier):
     And it takes a pursuer that backs onto the evader to be driving away.
     """
 
-    def robots(self, world: World) -> Float[Array, "n 3"]:
+    def robots(self, world: World) -> Float[Array, "n 3 *lanes"]:
         return world.pursuers
 
-    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
-        return _away(evader - robot[:2])[0] - scenario.capture_distance
+    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
+        return _away(evader, robot)[0] - scenario.capture_distance
 
     def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
-        normal = _away(evader - robot[:2])[1]
-        ahead = normal[0] * jnp.cos(robot[2]) + normal[1] * jnp.sin(robot[2])
-        return normal, scenario.pursuer_speed * ahead
+        _, x, y = _away(evader, robot)
+        ahead = x * jnp.cos(robot[2]) + y * jnp.sin(robot[2])
+        return stack(x, y), scenario.pursuer_speed * ahead
 
-    def allowance(self, scenario: Scenario, h: Any) -> Scalar:
+    def allowance(self, scenario: Scenario, h: Any) -> Lanes:
         return scenario.pursuer_gain * h
 
-    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return jnp.zeros_like(real(evader)[0])
 
 
@@ -219,25 +227,30 @@ class PursuitBarrier(Barrier):
     which for h = 0 is m cos S with m = b rho - l tan S. It is left at half of that, for the evader's own
     side, whose h is larger: with 2 |y| sin S = h_own - h, the change never lowers the value.
 
+    With `eased` (m) the row asks for no way back from as far below 0: alpha is 0 there. That is for a barrier
+    that keeps more than it must, and may be met by an evader in between.
+
     A robot is (x, y, heading), with known velocity followed by its wheel speeds (left, right; m/s).
     """
 
     known_velocity: bool = eqx.field(static=True, default=False)
+    eased: Scalar | float = 0.0
 
-    def robots(self, world: World) -> Float[Array, "n d"]:
+    def robots(self, world: World) -> Float[Array, "n d *lanes"]:
         if self.known_velocity:
-            return jnp.concatenate([world.pursuers, world.wheel_speeds], axis=-1)
+            return jnp.concatenate([world.pursuers, world.wheel_speeds], axis=1)
         return world.pursuers
 
-    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+    def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return CaptureGame.of(scenario).barrier(to_pursuer_frame(evader, robot[:3]), memory)[0]
 
     def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> _NormalAndRate:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(evader, robot[:3])
-        ahead, left = normal = game.barrier(z, memory)[1]
+        normal = game.barrier(z, memory)[1]
+        ahead, left = normal[0], normal[1]
         cosine, sine = jnp.cos(robot[2]), jnp.sin(robot[2])
-        world_normal = jnp.stack([cosine * ahead - sine * left, sine * ahead + cosine * left])
+        world_normal = stack(cosine * ahead - sine * left, sine * ahead + cosine * left)
         # A pursuer that turns at no cost (b = 0) has no finite rate; any that cannot be kept says the same.
         rate = jnp.minimum(game.pursuit_rate(z, normal), 1e3 * game.pursuer_speed)
         if self.known_velocity:
@@ -247,13 +260,13 @@ class PursuitBarrier(Barrier):
     def _known_rate(
         self,
         game: CaptureGame,
-        z: Float[Array, "2"],
-        normal: Float[Array, "2"],
-        wheel_speeds: Float[AnyArray, "2"],
-        fastest: Scalar,
-    ) -> Scalar:
+        z: Float[Array, "2 *lanes"],
+        normal: Float[Array, "2 *lanes"],
+        wheel_speeds: Float[AnyArray, "2 *lanes"],
+        fastest: Lanes,
+    ) -> Lanes:
         """v n_x - omega sigma (m/s), or `fastest` where the motion is not known or turning is free."""
-        known = jnp.all(jnp.isfinite(wheel_speeds)) & (game.half_axle > 0.0)
+        known = jnp.all(jnp.isfinite(wheel_speeds), axis=0) & (game.half_axle > 0.0)
         wheels = jnp.where(known, wheel_speeds, 0.0)
         wheels = jnp.clip(wheels, -game.pursuer_speed, game.pursuer_speed)
         speed, turn_rate = body_velocity(wheels, jnp.where(game.half_axle > 0.0, game.half_axle, 1.0))
@@ -301,15 +314,16 @@ class PursuitBarrier(Barrier):
         values, normals, offsets = jax.vmap(towards)(world.pursuers, world.wheel_speeds, real(memory))
         return BarrierRows(values.reshape(-1), normals.reshape(-1, 2), offsets.reshape(-1))
 
-    def allowance(self, scenario: Scenario, h: Any) -> Scalar:
+    def allowance(self, scenario: Scenario, h: Any) -> Lanes:
         game = CaptureGame.of(scenario)
         gain, axle = scenario.pursuer_gain, game.half_axle
         spare = jnp.maximum(game.largest_capture_distance - game.capture_distance, 0.0)
         turning = game.pursuer_speed * jnp.tan(game.usable_angle) / jnp.where(axle > 0.0, axle, 1.0)
         steep = jnp.maximum(gain, jnp.where(axle > 0.0, _STEEPER * turning, 0.0))
-        return gain * jnp.minimum(h, spare) + steep * jnp.maximum(h - spare, 0.0)
+        back = gain * jnp.minimum(h + self.eased, 0.0)
+        return gain * jnp.clip(h, 0.0, spare) + steep * jnp.maximum(h - spare, 0.0) + back
 
-    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Scalar:
+    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(evader, robot[:3])
         own_side = jnp.where(z[1] < 0.0, -1.0, 1.0).astype(z.dtype)
@@ -318,12 +332,41 @@ class PursuitBarrier(Barrier):
         side = jnp.where(real(memory) < 0.0, -1.0, 1.0).astype(z.dtype)
         return jnp.where(self._may_keep(scenario, game, z, side), side, own_side)
 
-    def _may_keep(self, scenario: Scenario, game: CaptureGame, z: Float[Array, "2"], side: Scalar) -> Flag:
+    def prefer(
+        self,
+        scenario: Scenario,
+        world: World,
+        memory: Float[AnyArray, "m *lanes"],
+        wish: Float[AnyArray, "2 *lanes"],
+    ) -> Float[Array, "m *lanes"]:
+        """`remember`, but on the side of each pursuer's axis to which a wished velocity (m/s) leads.
+
+        Close to the axis, where the rows of both sides are feasible, either may be followed; here the wish
+        decides. Without that an evader that a pursuer keeps turning after is led round in a circle to the
+        side it once took, and cannot turn back, whatever is in the way.
+        """
+        game = CaptureGame.of(scenario)
+
+        def side(robot: Float[Array, "3 *lanes"], side: Lanes) -> Lanes:
+            kept = self.recall(scenario, world.evader, robot, side)
+            z = to_pursuer_frame(world.evader, robot)
+            aside = jnp.cos(robot[2]) * wish[1] - jnp.sin(robot[2]) * wish[0]
+            wanted = jnp.where(aside < 0.0, -1.0, 1.0).astype(z.dtype)
+            decided = jnp.abs(aside) > _DECIDED * scenario.evader_speed
+            own = jnp.where(z[1] < 0.0, -1.0, 1.0)
+            free = (wanted == own) | self._may_keep(scenario, game, z, wanted)
+            return jnp.where(decided & free, wanted, kept)
+
+        return jax.vmap(side)(world.pursuers, real(memory))
+
+    def _may_keep(
+        self, scenario: Scenario, game: CaptureGame, z: Float[Array, "2 *lanes"], side: Lanes
+    ) -> Bool[Array, "*lanes"]:
         cosine, sine = jnp.cos(game.usable_angle), jnp.sin(game.usable_angle)
         ahead, across = jnp.abs(z[0]), jnp.maximum(-side * z[1], 0.0)
         in_front = jnp.abs(z[1]) * cosine < ahead * sine
 
-        def reach(h: Scalar) -> Scalar:
+        def reach(h: Lanes) -> Lanes:
             """How far across the axis the row of a side with value h stays feasible (m)."""
             turn = game.half_axle * (game.evader_speed + self.allowance(scenario, h)) / game.pursuer_speed
             return cosine * turn - sine * (game.capture_distance + h)

@@ -15,9 +15,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arrays import AnyArray, Flag, Scalar
+from sidestep._arrays import AnyArray, Lanes, Scalar
 from sidestep.safety.least_violation import Rows, part, relax, root
 from sidestep.safety.status import Status
 
@@ -34,17 +34,17 @@ _HARDER = 16.0
 class Projection(eqx.Module):
     """Answer of `project`: `action (2,)`, `status` (see `Status`), `slack` = min_i (n_i.action - c_i)."""
 
-    action: Float[Array, "2"]
-    status: Int[Array, ""]
-    slack: Scalar
+    action: Float[Array, "2 *lanes"]
+    status: Int[Array, "*lanes"]
+    slack: Float[Array, "*lanes"]
 
 
 class _Answer(eqx.Module):
     """An action in units of the speed limit, and by how much it misses the rows."""
 
-    x: Scalar
-    y: Scalar
-    violation: Scalar
+    x: Lanes
+    y: Lanes
+    violation: Lanes
 
 
 def tolerance(dtype: Any) -> float:
@@ -53,9 +53,9 @@ def tolerance(dtype: Any) -> float:
 
 
 def project(
-    nominal: Float[AnyArray, "2"],
-    normals: Float[AnyArray, "k 2"],
-    offsets: Float[AnyArray, "k"],
+    nominal: Float[AnyArray, "2 *lanes"],
+    normals: Float[AnyArray, "k 2 *lanes"],
+    offsets: Float[AnyArray, "k *lanes"],
     speed_limit: Float[AnyArray, ""] | float,
     *,
     hard: int = 0,
@@ -89,10 +89,10 @@ def project(
     if not 0 <= hard <= count:
         raise ValueError(f"hard = {hard}: it must be between 0 and the number of rows, {count}")
 
-    nominal_valid = jnp.all(jnp.isfinite(nominal))
+    nominal_valid = jnp.all(jnp.isfinite(nominal), axis=0)
     limit_valid = jnp.isfinite(limit) & (limit >= 0.0)
     row_valid = jnp.isfinite(normals[:, 0]) & jnp.isfinite(normals[:, 1]) & jnp.isfinite(offsets)
-    valid = nominal_valid & limit_valid & jnp.all(row_valid)
+    valid = nominal_valid & limit_valid & jnp.all(row_valid, axis=0)
     nominal = jnp.where(nominal_valid, nominal, 0.0)
     limit = jnp.where(limit_valid, limit, 0.0)
     x = jnp.where(row_valid, normals[:, 0], 0.0)
@@ -103,22 +103,14 @@ def project(
     unit = jnp.where(moving, limit, 1.0)
     wish, start, weight, unchanged = _aim(nominal, unit, circle)
     rows, void = _normalise(x, y, c, unit)
-    never = jnp.any(void & (c > tolerance(dtype) * unit))
+    never = jnp.any(void & (c > tolerance(dtype) * unit), axis=0)
 
-    relaxed = rows
-    given_way = jnp.zeros((), dtype)
-    for first, last in ((0, hard), (hard, count)):
-        if first < last:
-            # Harder rows already have their final offsets; softer ones do not count yet.
-            tier, level = relax(part(relaxed, 0, last), first, circle)
-            relaxed = Rows(*(jnp.concatenate([a, b[last:]]) for a, b in zip(tier, relaxed, strict=True)))
-            given_way = jnp.maximum(given_way, level)
-    answer = _closest(wish, start, weight, relaxed, hard, circle)
+    answer, given_way = _solve(wish, start, weight, rows, hard, circle)
 
     infeasible = (given_way > tolerance(dtype)) | (answer.violation > tolerance(dtype))
     # A robot that cannot move has one action: zero.
-    infeasible = never | jnp.where(moving, infeasible, jnp.any(c > 0.0))
-    stopped = jnp.all(nominal == 0.0)
+    infeasible = never | jnp.where(moving, infeasible, jnp.any(c > 0.0, axis=0))
+    stopped = jnp.all(nominal == 0.0, axis=0)
     kept = ~infeasible & (
         jnp.where(moving, unchanged & (answer.x == start[0]) & (answer.y == start[1]), stopped)
     )
@@ -128,13 +120,55 @@ def project(
         jnp.where(infeasible, Status.INFEASIBLE, jnp.where(kept, Status.OK, Status.CORRECTED)),
         Status.INVALID,
     ).astype(jnp.int32)
-    slack = jnp.min(jnp.where(row_valid, x * action[0] + y * action[1] - c, jnp.inf), initial=jnp.inf)
-    return Projection(action, status, slack)
+    slack = jnp.where(row_valid, x * action[0] + y * action[1] - c, jnp.inf)
+    return Projection(action, status, jnp.min(slack, axis=0, initial=jnp.inf))
+
+
+def project_known(
+    nominal: Float[Array, "2 *lanes"],
+    normals: Float[Array, "k 2 *lanes"],
+    offsets: Float[Array, "k *lanes"],
+    speed_limit: Scalar,
+    *,
+    hard: int = 0,
+    circle: bool = False,
+) -> Float[Array, "2 *lanes"]:
+    """The action of `project` alone, for input that is known to be good: a third of the work.
+
+    **Arguments:** as for `project`, but everything finite, normals of unit length, |nominal| <= the limit,
+    and that more than 0.
+    """
+    wish, weight = nominal / speed_limit, jnp.zeros(nominal.shape[1:], nominal.dtype)
+    start = wish
+    if circle:
+        wish, start, weight, _ = _aim(nominal, speed_limit, circle)
+    rows = Rows(normals[:, 0], normals[:, 1], offsets / speed_limit)
+    answer, _ = _solve(wish, start, weight, rows, hard, circle)
+    return speed_limit * jnp.stack([answer.x, answer.y])
+
+
+def _solve(
+    wish: Float[Array, "2 *lanes"],
+    start: Float[Array, "2 *lanes"],
+    weight: Lanes,
+    rows: Rows,
+    hard: int,
+    circle: bool,
+) -> tuple[_Answer, Lanes]:
+    """The best action, and by how much rows had to give way for it, both in units of the speed limit."""
+    relaxed, given_way = rows, jnp.zeros_like(weight)
+    for first, last in ((0, hard), (hard, rows.c.shape[0])):
+        if first < last:
+            # Harder rows already have their final offsets; softer ones do not count yet.
+            tier, level = relax(part(relaxed, 0, last), first, circle)
+            relaxed = Rows(*(jnp.concatenate([a, b[last:]]) for a, b in zip(tier, relaxed, strict=True)))
+            given_way = jnp.maximum(given_way, level)
+    return _closest(wish, start, weight, relaxed, hard, circle), given_way
 
 
 def _aim(
-    nominal: Float[Array, "2"], unit: Scalar, circle: bool
-) -> tuple[Float[Array, "2"], Float[Array, "2"], Scalar, Flag]:
+    nominal: Float[Array, "2 *lanes"], unit: Scalar, circle: bool
+) -> tuple[Float[Array, "2 *lanes"], Float[Array, "2 *lanes"], Lanes, Bool[Array, "*lanes"]]:
     """The nominal action in units of the limit (cut far out, where only its direction matters), its
     projection on the disc or circle, the weight of the distance measure, and whether it is there already.
 
@@ -146,7 +180,7 @@ def _aim(
     size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(nominal[0]), jnp.abs(nominal[1])))
     some = size > 0.0
     safe = jnp.where(some, size, 1.0)
-    scaled = jnp.where(some, nominal / safe, jnp.array([1.0, 0.0], nominal.dtype))
+    scaled = jnp.stack([jnp.where(some, nominal[0] / safe, 1.0), jnp.where(some, nominal[1] / safe, 0.0)])
     norm = jnp.sqrt(scaled[0] ** 2 + scaled[1] ** 2)
     direction = scaled / norm
     speed = jnp.where(some, norm * safe, 0.0) / unit
@@ -162,7 +196,7 @@ def _aim(
 
 
 def _normalise(
-    x: Float[Array, "k"], y: Float[Array, "k"], c: Float[Array, "k"], unit: Scalar
+    x: Float[Array, "k *lanes"], y: Float[Array, "k *lanes"], c: Float[Array, "k *lanes"], unit: Scalar
 ) -> tuple[Rows, Array]:
     """Unit normals and offsets in units of the limit; rows without a normal become n = 0, c = -2."""
     largest = float(jnp.finfo(x.dtype).max) / 8.0
@@ -184,12 +218,17 @@ def _worst(measure: Callable[[Any, Any], Any], lines: Any, rows: Any) -> Any:
     if count <= _UNROLLED:
         each = [measure(lines, [entry[j] for entry in rows]) for j in range(count)]
         return functools.reduce(lambda a, b: jax.tree.map(jnp.maximum, a, b), each)
-    table = measure([entry[:, None] for entry in lines], rows)
+    table = measure([entry[:, None] for entry in lines], [entry[None] for entry in rows])
     return jax.tree.map(lambda entry: jnp.max(entry, axis=1), table)
 
 
 def _closest(
-    wish: Float[Array, "2"], start: Float[Array, "2"], weight: Scalar, rows: Rows, hard: int, circle: bool
+    wish: Float[Array, "2 *lanes"],
+    start: Float[Array, "2 *lanes"],
+    weight: Lanes,
+    rows: Rows,
+    hard: int,
+    circle: bool,
 ) -> _Answer:
     """The closest feasible point, given that there is one; if rounding hides it, the least bad candidate.
 
@@ -247,12 +286,13 @@ def _closest(
     if 0 < hard < rows.c.shape[0]:
         rank = jnp.maximum(rank, _HARDER * jnp.maximum(_worst(miss, lines, part(rows, 0, hard)), outside))
     key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + rank)
-    chosen = jnp.arange(key.shape[0]) == jnp.argmin(key)
-    pick = lambda entry: jnp.sum(jnp.where(chosen, entry, 0.0))  # noqa: E731
+    lowest = jnp.argmin(key, axis=0)
+    chosen = jnp.stack([lowest == index for index in range(key.shape[0])])
+    pick = lambda entry: jnp.sum(jnp.where(chosen, entry, 0.0), axis=0)  # noqa: E731
 
     c = jnp.clip(c, -1.0, 1.0)  # whatever rounding did, the speed limit holds
-    missed = jnp.max(short_of_start)
-    stay = (missed <= tolerance(c.dtype)) | (_REJECTED + missed <= jnp.min(key))
+    missed = jnp.max(short_of_start, axis=0)
+    stay = (missed <= tolerance(c.dtype)) | (_REJECTED + missed <= jnp.min(key, axis=0))
     return _Answer(
         jnp.where(stay, start[0], pick(c * x - t * y)),
         jnp.where(stay, start[1], pick(c * y + t * x)),

@@ -81,25 +81,28 @@ class JointShield(Shield):
     It is run only near: `near_obstacle` and `near_pursuer` bound the clearance of the nearest obstacle and
     the pursuit barrier's value (m) up to which the rows cannot vouch on their own. Clear means `margin` (m)
     away from obstacles, or what there is now if that is less. `pursuer_gain` (1/s) replaces the scenario's:
-    a larger one leaves more room to move. A chase is imagined `horizon` (s) ahead, first in `fine_steps` of
-    the robot's own control period, then in `coarse_steps` longer ones; `lenience` (m) is how much closer to
-    a pursuer the longer ones may come. The decision carries no derivatives; the action does.
+    a larger one leaves more room to move, and to change sides close to a pursuer's axis. A chase is imagined
+    `fine_steps` of the robot's own control period ahead, 6 s at 20 Hz; then, if there are `coarse_steps`, in
+    these up to `horizon` (s), with `lenience` (m) for how much closer to a pursuer longer periods may come.
+    They cost less and promise too much: an evader that is turned after gains on a pursuer that decides less
+    often. The decision carries no derivatives; the action does.
     """
 
     scenario: Scenario
-    pursuer_gain: Scalar = eqx.field(converter=real, default=2.0)
-    near_obstacle: Scalar = eqx.field(converter=real, default=0.5)
+    pursuer_gain: Scalar = eqx.field(converter=real, default=4.0)
+    near_obstacle: Scalar = eqx.field(converter=real, default=0.8)
     near_pursuer: Scalar = eqx.field(converter=real, default=0.5)
     margin: Scalar = eqx.field(converter=real, default=0.02)
-    lenience: Scalar = eqx.field(converter=real, default=0.005)
+    lenience: Scalar = eqx.field(converter=real, default=0.0)
     horizon: Scalar = eqx.field(converter=real, default=6.0)
-    fine_steps: int = eqx.field(static=True, default=40)
-    coarse_steps: int = eqx.field(static=True, default=40)
+    fine_steps: int = eqx.field(static=True, default=120)
+    coarse_steps: int = eqx.field(static=True, default=0)
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 
     @property
     def _game(self) -> GameShield:
-        return GameShield(eqx.tree_at(lambda s: s.pursuer_gain, self.scenario, self.pursuer_gain))
+        scenario = eqx.tree_at(lambda s: s.pursuer_gain, self.scenario, self.pursuer_gain)
+        return GameShield(scenario, wish_picks_side=True)
 
     @property
     def rows_only(self) -> GameShield:
@@ -153,7 +156,7 @@ class JointShield(Shield):
 
         length = self.horizon / STRETCHES
         chosen = wish(self.scenario, world, sides, stretch(decision.way, decision.age, length))
-        evasive, _ = game(world, chosen, memory.sides)
+        evasive, evasive_sides = game(world, chosen, sides)
         nominal = jnp.asarray(nominal, chosen.dtype)
         wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
         evasive = eqx.tree_at(
@@ -163,7 +166,7 @@ class JointShield(Shield):
         )
         result = jax.tree.map(lambda a, b: jnp.where(decision.accept, a, b), greedy, evasive)
         return result, JointMemory(
-            sides,
+            jnp.where(decision.accept, sides, evasive_sides),
             decision.way,
             decision.age + self.scenario.control_period,
             need & decision.clear,
@@ -193,7 +196,7 @@ class JointShield(Shield):
         after = [
             self.scenario.step(situation.world, situation.action, wheels)[0] for wheels in situation.wheels
         ]
-        worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves)[:, None], *after)
+        worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1)[..., None], *after)
         outlook = self._imagine(worlds, situation.sides, situation.way[None], situation.age[None])
         return jnp.min(outlook.least) >= self._floor(situation.world)
 
@@ -215,7 +218,8 @@ class JointShield(Shield):
         ages = jnp.zeros(len(ways), length.dtype).at[0].set(situation.age)
         count = len(self.models)
         worlds = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (count, len(ways), *leaf.shape)), situation.world
+            lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, count, len(ways))),
+            situation.world,
         )
         outlook = self._imagine(worlds, situation.sides, ways, ages)
         clear = jnp.min(outlook.least, axis=0) >= self._floor(situation.world)
@@ -234,13 +238,13 @@ class JointShield(Shield):
 
     def _imagine(self, worlds: World, sides: Any, ways: Any, ages: Any) -> Outlook:
         models: tuple[Pursuer, ...] = tuple(make_pursuer(name) for name in self.models)
-        all_sides = jnp.broadcast_to(sides, (len(models), len(ways), *sides.shape))
+        all_sides = jnp.broadcast_to(sides[:, None, None], (*sides.shape, len(models), len(ways)))
         fine = jnp.broadcast_to(self.scenario.control_period, self.fine_steps)
-        rest = (self.horizon - jnp.sum(fine)) / self.coarse_steps
+        rest = jnp.maximum(self.horizon - jnp.sum(fine), 0.0) / max(self.coarse_steps, 1)
         periods = jnp.concatenate([fine, jnp.broadcast_to(rest, self.coarse_steps)])
         return imagine(
             self.scenario,
-            self._game,
+            self._game.heed,
             models,
             worlds,
             all_sides,

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sidestep._arrays import Scalar
+from sidestep._arrays import Lanes
 
 
 class Rows(NamedTuple):
     """Rows n.u >= c with unit normals n = (x, y); a row with n = 0 stands for no row at all."""
 
-    x: Float[Array, "*k"]
-    y: Float[Array, "*k"]
-    c: Float[Array, "*k"]
+    x: Float[Array, "..."]
+    y: Float[Array, "..."]
+    c: Float[Array, "..."]
 
 
 def root(value: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -35,7 +35,7 @@ def part(rows: Rows, start: int, stop: int | None = None) -> Rows:
     return Rows(rows.x[start:stop], rows.y[start:stop], rows.c[start:stop])
 
 
-def relax(rows: Rows, first: int, circle: bool) -> tuple[Rows, Scalar]:
+def relax(rows: Rows, first: int, circle: bool) -> tuple[Rows, Lanes]:
     """Lower the offsets of the rows from `first` on by their level, so that they can just hold.
 
     Offsets far above 1 are moved down together first (which moves the level, not the best action), so
@@ -55,12 +55,12 @@ def _within_reach(rows: Rows, first: int) -> Rows:
     """Offsets in [-2, 2]: below -1 a row always holds, above 1 only the differences to the largest matter."""
     live = rows.x**2 + rows.y**2 > 0.0
     c = jnp.where(live, rows.c, -2.0)
-    top = jnp.max(c[first:])
+    top = jnp.max(c[first:], axis=0)
     moved = jnp.where(top > 2.0, (c[first:] - top) + 2.0, c[first:])
     return Rows(rows.x, rows.y, jnp.maximum(jnp.concatenate([c[:first], moved]), -2.0))
 
 
-def _disc_level(rows: Rows, first: int) -> Scalar:
+def _disc_level(rows: Rows, first: int) -> Lanes:
     """Level in the unit disc.
 
     Helly's theorem in the plane: convex sets have a common point as soon as every three of them do. So
@@ -68,24 +68,25 @@ def _disc_level(rows: Rows, first: int) -> Scalar:
     form: disc and two rows (`_free_pair`, `_kept_pair`), or three rows (`_triple`).
     """
     count = rows.c.shape[0]
-    level = jnp.max(rows.c[first:]) - 1.0
+    level = jnp.max(rows.c[first:], axis=0) - 1.0
     pairs = list(combinations(range(count), 2))
     if free := [pair for pair in pairs if pair[0] >= first]:
         p, q = _take(rows, free)
-        level = jnp.maximum(level, jnp.max(_free_pair(p, q)))
+        level = jnp.maximum(level, jnp.max(_free_pair(p, q), axis=0))
     if mixed := [pair for pair in pairs if pair[0] < first <= pair[1]]:
         kept, other = _take(rows, mixed)
-        level = jnp.maximum(level, jnp.max(_kept_pair(kept, other)))
+        level = jnp.maximum(level, jnp.max(_kept_pair(kept, other), axis=0))
     # At least one of the three is free; the last one, as indices ascend.
     if triples := [three for three in combinations(range(count), 3) if three[2] >= first]:
         p, q, r = _take(rows, triples)
-        level = jnp.maximum(level, jnp.max(_triple(p, q, r, triples, first)))
+        level = jnp.maximum(level, jnp.max(_triple(p, q, r, triples, first), axis=0))
     return level
 
 
 def _take(rows: Rows, groups: Sequence[tuple[int, ...]]) -> list[Rows]:
     """The first rows of all groups, the second ones, and so on."""
-    return [Rows(*(entry[index] for entry in rows)) for index in np.array(groups).T]
+    pick = lambda entry, index: jnp.stack([entry[i] for i in index])  # noqa: E731
+    return [Rows(*(pick(entry, index) for entry in rows)) for index in zip(*groups, strict=True)]
 
 
 def _free_pair(p: Rows, q: Rows) -> Float[Array, "..."]:
@@ -116,7 +117,7 @@ def _kept_pair(kept: Rows, free: Rows) -> Float[Array, "..."]:
 
 def _triple(
     p: Rows, q: Rows, r: Rows, groups: Sequence[tuple[int, ...]], first: int
-) -> Float[Array, "triples"]:
+) -> Float[Array, "triples *lanes"]:
     """Level of three rows without the disc, by linear duality; -inf where it is unbounded.
 
     With multipliers l >= 0 such that sum l_i n_i = 0 (the cross products of the other two normals) the
@@ -124,7 +125,8 @@ def _triple(
     can hold are never said not to.
     """
     eps = float(jnp.finfo(p.c.dtype).eps)
-    free1, free2, free3 = (first <= np.array(groups).T).astype(p.c.dtype)
+    free = (first <= np.array(groups).T).astype(p.c.dtype)
+    free1, free2, free3 = free.reshape(*free.shape, *[1] * (p.c.ndim - 1))
     one, two, three = q.x * r.y - q.y * r.x, r.x * p.y - r.y * p.x, p.x * q.y - p.y * q.x
     weight = one * free1 + two * free2 + three * free3
     total = one * p.c + two * q.c + three * r.c
@@ -135,7 +137,7 @@ def _triple(
     return jnp.where(bounded, jnp.minimum(total / safe, 4.0) - 32.0 * eps / jnp.abs(safe), -jnp.inf)
 
 
-def _circle_level(rows: Rows, first: int) -> Scalar:
+def _circle_level(rows: Rows, first: int) -> Lanes:
     """Level on the unit circle: the best of the actions where the largest violation can be least.
 
     On the circle v_i is a sinusoid, so the least of their maximum lies at the bottom n_i of one, where
@@ -151,8 +153,8 @@ def _circle_level(rows: Rows, first: int) -> Scalar:
     foot, rise = gap / safe, root(1.0 - gap**2 / safe) / jnp.sqrt(safe)
     # Swapping the two rows gives the other of the two crossings.
     crossings = (
-        jnp.where(meet, foot * dx - rise * dy, p.x).reshape(-1),
-        jnp.where(meet, foot * dy + rise * dx, p.y).reshape(-1),
+        jnp.where(meet, foot * dx - rise * dy, p.x).reshape(-1, *rows.c.shape[1:]),
+        jnp.where(meet, foot * dy + rise * dx, p.y).reshape(-1, *rows.c.shape[1:]),
     )
     half = root(1.0 - kept.c**2)
     x = jnp.concatenate(
@@ -166,6 +168,7 @@ def _circle_level(rows: Rows, first: int) -> Scalar:
     excess = jnp.maximum(jnp.max(violation[:, :first], axis=1, initial=-jnp.inf), 0.0)
     level = jnp.max(violation[:, first:], axis=1)
     key = jnp.where(on_circle, jnp.where(excess <= 64.0 * eps, level, 8.0 + excess), jnp.inf)
-    best = jnp.arange(key.shape[0]) == jnp.argmin(key)
+    lowest = jnp.argmin(key, axis=0)
+    best = jnp.stack([lowest == index for index in range(key.shape[0])])
     # With no action on the circle (every row void) nothing can be violated.
-    return jnp.where(jnp.any(on_circle), jnp.sum(jnp.where(best, level, 0.0)), 0.0)
+    return jnp.where(jnp.any(on_circle, axis=0), jnp.sum(jnp.where(best, level, 0.0), axis=0), 0.0)

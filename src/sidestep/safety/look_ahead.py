@@ -7,7 +7,7 @@ as the real one does, and what remains to be seen is whether obstacles stay clea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sidestep._arrays import Count, Scalar, norm
+from sidestep._arrays import Count, Lanes, Scalar, length, stack
 from sidestep.pursuit import Pursuer, pursue
 from sidestep.safety.barriers import PursuitBarrier
 from sidestep.world.scenario import Scenario
@@ -32,7 +32,9 @@ WayOut = Int[Array, "stretches"]
 """The wish of each stretch, by number."""
 
 
-def wish(scenario: Scenario, world: World, sides: Float[Array, "m"], number: Count) -> Float[Array, "2"]:
+def wish(
+    scenario: Scenario, world: World, sides: Float[Array, "m *lanes"], number: Int[Array, "*lanes"]
+) -> Float[Array, "2 *lanes"]:
     """Velocity (m/s, world axes) of wish `number` in this world.
 
     The last four are relative to the first pursuer and turn as it turns: along the pursuit barrier's normal,
@@ -40,12 +42,18 @@ def wish(scenario: Scenario, world: World, sides: Float[Array, "m"], number: Cou
     before it can drive; and a stop, which leaves the choice to the rows.
     """
     angle = 2.0 * jnp.pi * number.astype(world.evader.dtype) / HEADINGS
-    held = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    held = jnp.cos(angle), jnp.sin(angle)
     away, _ = PursuitBarrier().approach(scenario, world.evader, world.pursuer, sides[0])
     heading = world.pursuer[2]
-    left = jnp.stack([-jnp.sin(heading), jnp.cos(heading)])
-    options = jnp.stack([held, away, left, -left, jnp.zeros_like(held)])
-    return scenario.evader_speed * options[jnp.maximum(number - HEADINGS + 1, 0)]
+    left = -jnp.sin(heading), jnp.cos(heading)
+    relative = number - HEADINGS
+    sign = jnp.where(relative == 1, 1.0, -1.0).astype(away.dtype)
+
+    def component(i: int) -> Lanes:
+        chosen = jnp.where(relative == 0, away[i], sign * left[i])
+        return jnp.where(relative < 0, held[i], jnp.where(relative == 3, 0.0, chosen))
+
+    return scenario.evader_speed * stack(component(0), component(1))
 
 
 def stretch(way: WayOut, age: Scalar, length: Scalar) -> Count:
@@ -53,15 +61,19 @@ def stretch(way: WayOut, age: Scalar, length: Scalar) -> Count:
     return way[jnp.clip((age / length).astype(jnp.int32), 0, STRETCHES - 1)]
 
 
-def clearance(scenario: Scenario, world: World, lenience: Scalar) -> Scalar:
+def clearance(scenario: Scenario, world: World, lenience: Scalar) -> Lanes:
     """Distance (m) left before the evader collides or is captured; negative in contact.
 
     Captures are the rows' business, and a chase imagined in longer periods than the robot's makes them a
     little worse than they are: `lenience` (m) is added to the distance to pursuers.
     """
-    to_pursuers = norm(world.pursuers[:, :2] - world.evader) - scenario.capture_distance + lenience
-    to_obstacles = norm(world.obstacles[:, :2] - world.evader) - scenario.collision_distance
-    return jnp.minimum(jnp.min(to_pursuers, initial=jnp.inf), jnp.min(to_obstacles, initial=jnp.inf))
+    x, y = world.evader[0], world.evader[1]
+    to_pursuers = length(world.pursuers[:, 0] - x, world.pursuers[:, 1] - y)
+    to_obstacles = length(world.obstacles[:, 0] - x, world.obstacles[:, 1] - y)
+    return jnp.minimum(
+        jnp.min(to_pursuers - scenario.capture_distance + lenience, axis=0, initial=jnp.inf),
+        jnp.min(to_obstacles - scenario.collision_distance, axis=0, initial=jnp.inf),
+    )
 
 
 class Outlook(eqx.Module):
@@ -74,10 +86,10 @@ class Outlook(eqx.Module):
 
 def imagine(
     scenario: Scenario,
-    guard: Any,
+    guard: Callable[..., Any],
     models: Sequence[Pursuer],
     worlds: World,
-    sides: Float[Array, "models n m"],
+    sides: Float[Array, "m models n"],
     ways: Int[Array, "n stretches"],
     ages: Float[Array, "n"],
     periods: Float[Array, "steps"],
@@ -86,39 +98,29 @@ def imagine(
 ) -> Outlook:
     """What becomes of ways out when they are followed.
 
-    **Arguments:** `guard(world, wish, sides) -> (result, sides)`, the rows; `worlds` and `sides` with leading
-    axes (models, n), the pursuers of `worlds[i]` being driven by `models[i]`; `ways` the way out followed in
-    each, `ages` how long (s) it has been followed already, `length` of its stretches (s); `periods` the
-    periods (s) to imagine, one by one; `lenience` see `clearance`.
+    **Arguments:** `guard(world, wish, sides) -> (action, sides)`, the rows; `worlds` and `sides` with axes
+    (models, n) behind their own, model i driving the pursuers of `worlds[..., i, :]`; `ways` the way out
+    followed in each, `ages` how long (s) it has been followed already, `length` of its stretches (s);
+    `periods` the periods (s) to imagine, one by one; `lenience` see `clearance`.
     """
     key = jax.random.key(0)  # the models do not draw
+    lanes = (len(models), len(ways))
 
     def step(carry: Any, period: Scalar) -> tuple[Any, None]:
         worlds, sides, ages, outlook = carry
         paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, period)
         numbers = jax.vmap(stretch, in_axes=(0, 0, None))(ways, ages, length)
-
-        def decide(world: World, sides: Any, number: Count) -> tuple[Any, Any]:
-            result, sides = guard(world, wish(scenario, world, sides, number), sides)
-            return result.action, sides
-
-        actions, sides = jax.vmap(jax.vmap(decide), in_axes=(0, 0, None))(worlds, sides, numbers)
+        wished = wish(scenario, worlds, sides, jnp.broadcast_to(numbers, lanes))
+        actions, sides = guard(worlds, wished, sides)
+        each = [jax.tree.map(lambda leaf, i=i: leaf[..., i, :], worlds) for i in range(len(models))]
         wheels = jnp.stack(
-            [
-                jax.vmap(lambda world, model=model: pursue(paced, model, world, key))(
-                    jax.tree.map(lambda leaf, index=index: leaf[index], worlds)
-                )
-                for index, model in enumerate(models)
-            ]
+            [pursue(paced, model, world, key) for model, world in zip(models, each, strict=True)], axis=-2
         )
-        move = lambda world, action, wheels: paced.step(world, action, wheels)[0]  # noqa: E731
-        worlds = jax.vmap(jax.vmap(move))(worlds, actions, wheels)
-        now = jax.vmap(jax.vmap(lambda world: clearance(scenario, world, lenience)))(worlds)
-        least = jnp.minimum(outlook.least, now)
+        worlds = paced.moved(worlds, actions, wheels)
+        least = jnp.minimum(outlook.least, clearance(scenario, worlds, lenience))
         time = outlook.time + jnp.where(least > 0.0, period, 0.0)
         return (worlds, sides, ages + period, Outlook(time, least)), None
 
-    shape = (len(models), len(ways))
-    begin = Outlook(jnp.zeros(shape, ages.dtype), jnp.full(shape, jnp.inf, ages.dtype))
+    begin = Outlook(jnp.zeros(lanes, ages.dtype), jnp.full(lanes, jnp.inf, ages.dtype))
     (_, _, _, outlook), _ = jax.lax.scan(step, (worlds, sides, ages, begin), periods)
     return outlook

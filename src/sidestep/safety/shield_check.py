@@ -20,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sidestep._arrays import Scalar
 from sidestep.safety.barriers import PursuitBarrier
 from sidestep.safety.flow_map import seen_from, side_value, turn_drive_turn
-from sidestep.safety.sampling_margin import guarded
+from sidestep.safety.sampling_margin import guarded, sampling_margin
 from sidestep.world.scenario import Scenario
 
 _LEVELS = 80
@@ -43,10 +44,11 @@ class ShieldLevel:
 
 @eqx.filter_jit
 def _rows(
-    scenario: Scenario, points: Float[Array, "n 2"]
+    scenario: Scenario, eased: Scalar, points: Float[Array, "n 2"]
 ) -> tuple[Bool[Array, "n"], Float[Array, "n 2"], Float[Array, "n"]]:
     """Per point of the pursuer's frame: whether the left side is kept there, and the left side's row."""
-    barrier, origin, left = PursuitBarrier(), jnp.zeros(3, points.dtype), jnp.ones((), points.dtype)
+    barrier = PursuitBarrier(eased=eased)
+    origin, left = jnp.zeros(3, points.dtype), jnp.ones((), points.dtype)
 
     def at(z: Float[Array, "2"]) -> tuple[Array, Array, Array]:
         _, normal, offset = barrier.row(scenario, z, origin, left)
@@ -56,8 +58,9 @@ def _rows(
 
 
 @eqx.filter_jit
-def _keeps_left(scenario: Scenario, points: Float[Array, "n 2"]) -> Bool[Array, "n"]:
-    barrier, origin, left = PursuitBarrier(), jnp.zeros(3, points.dtype), jnp.ones((), points.dtype)
+def _keeps_left(scenario: Scenario, eased: Scalar, points: Float[Array, "n 2"]) -> Bool[Array, "n"]:
+    barrier = PursuitBarrier(eased=eased)
+    origin, left = jnp.zeros(3, points.dtype), jnp.ones((), points.dtype)
     return jax.vmap(lambda z: barrier.recall(scenario, z, origin, left) > 0.0)(points)
 
 
@@ -89,7 +92,7 @@ def _allowed(
 
 def shield_level(scenario: Scenario) -> ShieldLevel:
     """The level that the `game` shield keeps against every pursuer, for exact measurements, on the grid."""
-    scenario = guarded(scenario)
+    eased, scenario = sampling_margin(scenario), guarded(scenario)
     speed, period = float(scenario.evader_speed), float(scenario.control_period)
     rim, axle = float(scenario.pursuer_speed), float(scenario.pursuer_half_axle)
     wanted, angle = float(scenario.capture_distance), float(scenario.usable_angle)
@@ -104,7 +107,7 @@ def shield_level(scenario: Scenario) -> ShieldLevel:
     # Twice: over all levels, then more finely above the best of them.
     for _ in range(2):
         least = np.array(
-            [_next_level(scenario, q, angle, 0.15 * wanted, poses, speed, period) for q in levels]
+            [_next_level(scenario, eased, q, angle, 0.15 * wanted, poses, speed, period) for q in levels]
         )
         reached = np.minimum.accumulate(least[::-1])[::-1]
         kept = np.flatnonzero((reached >= levels - _ROUNDING) & (levels <= wanted))
@@ -119,6 +122,7 @@ def shield_level(scenario: Scenario) -> ShieldLevel:
 
 def _next_level(
     scenario: Scenario,
+    eased: Scalar,
     level: float,
     angle: float,
     beyond: float,
@@ -129,7 +133,7 @@ def _next_level(
     """The least value after one period from any point of the level at which the left side is followed."""
     points = _boundary(level, angle, beyond)
     kept, normals, offsets = (
-        np.asarray(part, float) for part in _rows(scenario, jnp.asarray(points, dtype=float))
+        np.asarray(part, float) for part in _rows(scenario, eased, jnp.asarray(points, dtype=float))
     )
     here = (kept > 0.0) & (np.abs(side_value(points, angle, 1.0) - level) < 1e-9)
     allowed = _allowed(normals, offsets, speed, circle=scenario.action == "heading")
@@ -144,6 +148,6 @@ def _next_level(
         flat = after[lost]
         padded = np.zeros((-(-len(flat) // 4096) * 4096, 2))
         padded[: len(flat)] = flat
-        stays = np.asarray(_keeps_left(scenario, jnp.asarray(padded, dtype=float)))[: len(flat)]
+        stays = np.asarray(_keeps_left(scenario, eased, jnp.asarray(padded, dtype=float)))[: len(flat)]
         value[lost] = np.where(stays, value[lost], other[lost])
     return float(np.min(value[here]))

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arrays import AnyArray, Scalar
+from sidestep._arrays import AnyArray
 from sidestep.safety.barriers import (
     Barrier,
     BarrierRows,
@@ -16,7 +16,7 @@ from sidestep.safety.barriers import (
     RangeBarrier,
     compose,
 )
-from sidestep.safety.filter import project
+from sidestep.safety.filter import project, project_known
 from sidestep.safety.least_violation import root
 from sidestep.safety.sampling_margin import TOUCH, guarded, sampling_margin
 from sidestep.safety.status import Status
@@ -34,11 +34,11 @@ class ShieldResult(eqx.Module):
     - `intervention` |action - nominal|, m/s
     """
 
-    action: Float[Array, "2"]
-    status: Int[Array, ""]
-    barriers: Float[Array, "n"]
-    slack: Scalar
-    intervention: Scalar
+    action: Float[Array, "2 *lanes"]
+    status: Int[Array, "*lanes"]
+    barriers: Float[Array, "n *lanes"]
+    slack: Float[Array, "*lanes"]
+    intervention: Float[Array, "*lanes"]
 
 
 class Shield(eqx.Module):
@@ -60,7 +60,9 @@ class Shield(eqx.Module):
         """The memory (a pytree) at the start of an episode."""
 
     @abc.abstractmethod
-    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
         """Filter the nominal velocity (m/s, world axes).
 
         **Returns** the `ShieldResult` and the memory for the next call. Non-finite input (a nominal
@@ -68,33 +70,33 @@ class Shield(eqx.Module):
         """
 
 
-def _known(world: World) -> Bool[Array, "n"]:
+def _known(world: World) -> Bool[Array, "n *lanes"]:
     """Per pursuer and obstacle: whether it and the evader are where numbers say.
 
     Asked of the world itself, because a NaN can vanish on its way into a row: every comparison with it is
     false, and a `where` then takes the other case.
     """
-    robots = [jnp.all(jnp.isfinite(group), axis=-1) for group in (world.pursuers, world.obstacles)]
-    return jnp.concatenate(robots) & jnp.all(jnp.isfinite(world.evader))
+    robots = [jnp.all(jnp.isfinite(group), axis=1) for group in (world.pursuers, world.obstacles)]
+    return jnp.concatenate(robots) & jnp.all(jnp.isfinite(world.evader), axis=0)
 
 
 def _decide(
     scenario: Scenario,
     world: World,
-    nominal: Float[AnyArray, "2"],
+    nominal: Float[AnyArray, "2 *lanes"],
     rows: BarrierRows,
     *,
     enforced: bool,
     hard: int,
-    known: Bool[Array, "n"] | None = None,
+    known: Bool[Array, "n *lanes"] | None = None,
 ) -> ShieldResult:
     nominal = jnp.asarray(nominal, rows.values.dtype)
     known = _known(world) if known is None else known
     known &= jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
-    known &= jnp.all(jnp.isfinite(rows.normals), axis=-1)
-    wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
+    known &= jnp.all(jnp.isfinite(rows.normals), axis=1)
+    wanted = jnp.where(jnp.all(jnp.isfinite(nominal), axis=0), nominal, 0.0)
     # With part of the world unknown nothing vouches for the nominal action.
-    vouched = jnp.where(jnp.all(known), nominal, 0.0)
+    vouched = jnp.where(jnp.all(known, axis=0), nominal, 0.0)
     count = rows.offsets.shape[0] if enforced else 0
     projection = project(
         vouched,
@@ -104,18 +106,20 @@ def _decide(
         hard=hard if enforced else 0,
         circle=scenario.action == "heading",
     )
-    status = jnp.where(jnp.all(known), projection.status, Status.INVALID).astype(projection.status.dtype)
+    status = jnp.where(jnp.all(known, axis=0), projection.status, Status.INVALID).astype(
+        projection.status.dtype
+    )
     return ShieldResult(
         action=projection.action,
         status=status,
         barriers=jnp.where(known, rows.values, -jnp.inf),
         slack=projection.slack,
-        intervention=root(jnp.sum((projection.action - wanted) ** 2)),
+        intervention=root(jnp.sum((projection.action - wanted) ** 2, axis=0)),
     )
 
 
 def _with_obstacles(
-    barrier: Barrier, scenario: Scenario, world: World, memory: Float[Array, "m"]
+    barrier: Barrier, scenario: Scenario, world: World, memory: Float[Array, "m *lanes"]
 ) -> BarrierRows:
     """Rows towards all pursuers, then towards all obstacles."""
     obstacle = ObstacleBarrier()
@@ -136,7 +140,9 @@ class NoShield(Shield):
     def init(self, world: World) -> Any:
         return RangeBarrier().remember(self.scenario, world)
 
-    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
         rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
         return _decide(self.scenario, world, nominal, rows, enforced=False, hard=0), memory
 
@@ -154,7 +160,9 @@ class PaperShield(Shield):
     def init(self, world: World) -> Any:
         return RangeBarrier().remember(self.scenario, world)
 
-    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
         rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
         hard = self.scenario.pursuer_count
         return _decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
@@ -172,26 +180,63 @@ class GameShield(Shield):
     `known_velocity=True` is for a pursuer whose next wheel speeds are known, because it announces them or
     they can be computed: whoever calls puts them into `world.wheel_speeds`. The rows are then those of
     `PursuitBarrier.rows_over_period`, two for each pursuer, which need no margin and interfere less.
+
+    `wish_picks_side=True` lets the nominal action choose the side of a pursuer's axis where either will do,
+    see `PursuitBarrier.prefer`.
     """
 
     scenario: Scenario
     known_velocity: bool = eqx.field(static=True, default=False)
+    wish_picks_side: bool = eqx.field(static=True, default=False)
 
     def init(self, world: World) -> Any:
         return PursuitBarrier().remember(self.scenario, world)
 
-    def __call__(self, world: World, nominal: Float[AnyArray, "2"], memory: Any) -> tuple[ShieldResult, Any]:
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
         if self.known_velocity:
             return self._over_period(world, nominal, memory)
         kept, m = guarded(self.scenario), self.scenario.pursuer_count
-        memory = PursuitBarrier().remember(kept, world, memory)
-        rows = _with_obstacles(PursuitBarrier(), kept, world, memory)
+        memory = self._sides(kept, world, nominal, memory)
+        rows = _with_obstacles(self._barrier, kept, world, memory)
         values = rows.values.at[:m].add(sampling_margin(self.scenario)).at[m:].add(TOUCH)
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
         return _decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
 
+    @property
+    def _barrier(self) -> PursuitBarrier:
+        """Where the margin has been used up the row still holds what is left, and asks for no more."""
+        return PursuitBarrier(eased=sampling_margin(self.scenario))
+
+    def _sides(self, kept: Scenario, world: World, wish: Any, memory: Any) -> Float[Array, "m *lanes"]:
+        if self.wish_picks_side:
+            return self._barrier.prefer(kept, world, memory, wish)
+        return self._barrier.remember(kept, world, memory)
+
+    def heed(
+        self, world: World, wish: Float[Array, "2 *lanes"], memory: Float[Array, "m *lanes"]
+    ) -> tuple[Float[Array, "2 *lanes"], Float[Array, "m *lanes"]]:
+        """The action (m/s) alone, and the next memory, for a finite world and a wish within the speed limit.
+
+        The same as calling the shield, without what it takes to be sure of its input and to report: for
+        chases that are only imagined.
+        """
+        kept = guarded(self.scenario)
+        memory = self._sides(kept, world, wish, memory)
+        rows = _with_obstacles(self._barrier, kept, world, memory)
+        action = project_known(
+            wish,
+            rows.normals,
+            rows.offsets,
+            kept.evader_speed,
+            hard=kept.pursuer_count,
+            circle=kept.action == "heading",
+        )
+        return action, memory
+
     def _over_period(
-        self, world: World, nominal: Float[AnyArray, "2"], memory: Any
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
         barrier, obstacle, m = PursuitBarrier(), ObstacleBarrier(), self.scenario.pursuer_count
         memory = barrier.remember(self.scenario, world, memory)

@@ -3,14 +3,16 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Scalar, norm
+from sidestep._arrays import AnyArray, Lanes, Scalar, length, stack
 
 
-def to_pursuer_frame(point: Float[AnyArray, "2"], pose: Float[AnyArray, "3"]) -> Float[Array, "2"]:
+def to_pursuer_frame(
+    point: Float[AnyArray, "2 *lanes"], pose: Float[AnyArray, "3 *lanes"]
+) -> Float[Array, "2 *lanes"]:
     """z = R(-theta)(p_e - p_d): a world point (m) in the frame of a pursuer at `pose` (x ahead, y left)."""
-    offset = point - pose[:2]
+    x, y = point[0] - pose[0], point[1] - pose[1]
     cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
-    return jnp.stack([cosine * offset[0] + sine * offset[1], -sine * offset[0] + cosine * offset[1]])
+    return stack(cosine * x + sine * y, -sine * x + cosine * y)
 
 
 def usable_angle(evader_speed: Float[AnyArray, ""], pursuer_speed: Float[AnyArray, ""]) -> Scalar:
@@ -19,8 +21,8 @@ def usable_angle(evader_speed: Float[AnyArray, ""], pursuer_speed: Float[AnyArra
 
 
 def capture_set_distance(
-    z: Float[AnyArray, "2"], usable: Float[AnyArray, ""], capture_distance: Float[AnyArray, ""]
-) -> Scalar:
+    z: Float[AnyArray, "2 *lanes"], usable: Float[AnyArray, ""], capture_distance: Float[AnyArray, ""]
+) -> Lanes:
     """Signed distance (m) from the capture set K(l): h = r cos((S - beta')+) - l.
 
     beta' is the angle between z and the pursuer's axis, front or rear. K is the convex hull of the
@@ -32,4 +34,4 @@ def capture_set_distance(
     ahead, aside = jnp.abs(z[0]), jnp.abs(z[1])
     cosine, sine = jnp.cos(usable), jnp.sin(usable)
     in_front = aside * cosine < ahead * sine
-    return jnp.where(in_front, ahead * cosine + aside * sine, norm(z)) - capture_distance
+    return jnp.where(in_front, ahead * cosine + aside * sine, length(z[0], z[1])) - capture_distance

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Scalar, norm, real
+from sidestep._arrays import AnyArray, Lanes, Scalar, norm, real
 
 _CHORDS = 4
 _NEWTON_STEPS = 2
@@ -25,8 +25,8 @@ def limit_speed(velocity: Float[AnyArray, "2"], speed_limit: Float[AnyArray, ""]
 
 
 def limit_wheels(
-    wheel_speeds: Float[AnyArray, "... 2"], rim_speed: Float[AnyArray, ""]
-) -> Float[Array, "... 2"]:
+    wheel_speeds: Float[AnyArray, "*shape"], rim_speed: Float[AnyArray, ""]
+) -> Float[Array, "*shape"]:
     """Clip wheel rim speeds (m/s) to [-V, V], which is |v| + b|omega| <= V; non-finite ones become 0."""
     finite = jnp.where(jnp.isfinite(wheel_speeds), wheel_speeds, 0.0)
     return jnp.clip(finite, -rim_speed, rim_speed)
@@ -38,8 +38,8 @@ def wrap_angle(angle: Float[AnyArray, "..."]) -> Float[Array, "..."]:
 
 
 def body_velocity(
-    wheel_speeds: Float[AnyArray, "2"], half_axle: Float[AnyArray, ""]
-) -> tuple[Scalar, Scalar]:
+    wheel_speeds: Float[AnyArray, "2 *lanes"], half_axle: Float[AnyArray, ""]
+) -> tuple[Lanes, Lanes]:
     """Speed v (m/s) and turn rate omega (rad/s) of a differential drive.
 
     v = (u1 + u2)/2 and omega = (u2 - u1)/(2b), with u1, u2 the left and right wheel *rim speeds* in
@@ -51,18 +51,18 @@ def body_velocity(
 
 
 def wheels_from_body(
-    speed: Float[AnyArray, ""], turn_rate: Float[AnyArray, ""], half_axle: Float[AnyArray, ""]
-) -> Float[Array, "2"]:
+    speed: Float[AnyArray, "*lanes"], turn_rate: Float[AnyArray, "*lanes"], half_axle: Float[AnyArray, ""]
+) -> Float[Array, "2 *lanes"]:
     """Wheel rim speeds (left, right) in m/s that give speed v and turn rate omega."""
     return jnp.stack([speed - half_axle * turn_rate, speed + half_axle * turn_rate])
 
 
 def drive(
-    pose: Float[AnyArray, "3"],
-    wheel_speeds: Float[AnyArray, "2"],
+    pose: Float[AnyArray, "3 *lanes"],
+    wheel_speeds: Float[AnyArray, "2 *lanes"],
     half_axle: Float[AnyArray, ""],
     duration: Float[AnyArray, ""],
-) -> Float[Array, "3"]:
+) -> Float[Array, "3 *lanes"]:
     """Differential drive: exact motion while the wheel speeds are held.
 
     The path is a circular arc. Its chord has length v T sinc(omega T / 2) and points half the turn
@@ -85,8 +85,10 @@ def drive(
 
 
 def glide(
-    position: Float[AnyArray, "2"], velocity: Float[AnyArray, "2"], duration: Float[AnyArray, ""]
-) -> Float[Array, "2"]:
+    position: Float[AnyArray, "2 *lanes"],
+    velocity: Float[AnyArray, "2 *lanes"],
+    duration: Float[AnyArray, ""],
+) -> Float[Array, "2 *lanes"]:
     """Omnidirectional robot or drifting obstacle: straight motion at constant velocity."""
     return jnp.asarray(position) + velocity * duration
 

@@ -188,21 +188,9 @@ class Scenario(eqx.Module):
         pursuer_clearance = jnp.min(to_pursuers, initial=jnp.inf) - self.capture_distance
         obstacle_clearance = jnp.min(to_obstacles, initial=jnp.inf) - self.collision_distance
 
-        # Counting whole periods keeps float32 time exact enough to compare with the limit.
-        periods = jnp.round(world.time / period) + 1.0
-        moved = World(
-            evader=glide(world.evader, velocity, period),
-            pursuers=jax.vmap(drive, in_axes=(0, 0, None, None))(
-                world.pursuers, wheels, self.pursuer_half_axle, period
-            ),
-            obstacles=jnp.concatenate(
-                [world.obstacles[:, :2] + world.obstacles[:, 2:] * period, world.obstacles[:, 2:]], axis=-1
-            ),
-            target=world.target,
-            time=periods * period,
-            evader_velocity=velocity,
-            wheel_speeds=wheels,
-        )
+        moved = self.moved(world, velocity, wheels)
+        # As counted there, in whole periods.
+        periods = jnp.round(moved.time / period)
         captured = pursuer_clearance <= 0.0
         collided = obstacle_clearance <= 0.0
         reached = (to_target <= self.reach_distance) & ~captured & ~collided
@@ -216,6 +204,31 @@ class Scenario(eqx.Module):
             timed_out=timed_out,
             pursuer_clearance=pursuer_clearance,
             obstacle_clearance=obstacle_clearance,
+        )
+
+    def moved(
+        self,
+        world: World,
+        velocity: Float[Array, "2 *lanes"],
+        wheel_speeds: Float[Array, "m 2 *lanes"],
+    ) -> World:
+        """Where everything is one control period later, for commands that the robots can execute."""
+        period, obstacles = self.control_period, world.obstacles
+        # Counting whole periods keeps float32 time exact enough to compare with the limit.
+        periods = jnp.round(world.time / period) + 1.0
+        return eqx.tree_at(
+            lambda w: (w.evader, w.pursuers, w.obstacles, w.time, w.evader_velocity, w.wheel_speeds),
+            world,
+            (
+                glide(world.evader, velocity, period),
+                jax.vmap(drive, in_axes=(0, 0, None, None))(
+                    world.pursuers, wheel_speeds, self.pursuer_half_axle, period
+                ),
+                jnp.concatenate([obstacles[:, :2] + obstacles[:, 2:] * period, obstacles[:, 2:]], axis=1),
+                periods * period,
+                velocity,
+                wheel_speeds,
+            ),
         )
 
     def executable(self, velocity: Float[AnyArray, "2"]) -> Float[Array, "2"]:

@@ -52,7 +52,7 @@ class World(eqx.Module):
         )
 
     @property
-    def pursuer(self) -> Float[AnyArray, "3"]:
+    def pursuer(self) -> Float[AnyArray, "3 *lanes"]:
         """The pursuer being steered or asked about: x, y, heading."""
         return self.pursuers[0]
 

@@ -1,4 +1,4 @@
-"""The study of captures behind the game shield: does it count right, and go on where it stopped?"""
+"""The studies of many episodes: do they count right, and go on where they stopped?"""
 
 import importlib.util
 import json
@@ -11,13 +11,14 @@ import pytest
 
 from sidestep.world import load_scenario, observation_names
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "game_captures.py"
+PATH = Path(__file__).parents[2] / "benchmarks" / "many_episodes.py"
 
 
 @pytest.fixture(scope="module")
 def study():
-    spec = importlib.util.spec_from_file_location("game_captures", PATH)
+    spec = importlib.util.spec_from_file_location("many_episodes", PATH)
     module = importlib.util.module_from_spec(spec)
+    sys.modules["many_episodes"] = module  # where its dataclass looks for its annotations
     spec.loader.exec_module(module)
     return module
 
@@ -29,7 +30,7 @@ def run(study, tmp_path, monkeypatch):
     def call(*options):
         out = tmp_path / "captures.json"
         few = ["--pursuers", "turn-then-drive", "--policies", "reckless", "--block", "64"]
-        arguments = ["game_captures", "--out", str(out), *few, "--set", "episode_steps=200", *options]
+        arguments = ["many_episodes", "game", "--out", str(out), *few, "--set", "episode_steps=200", *options]
         monkeypatch.setattr(sys, "argv", arguments)
         study.main()
         return json.loads(out.read_text())
@@ -51,7 +52,7 @@ def test_an_interrupted_study_goes_on_and_comes_to_the_same(study, run, monkeypa
     assert first["total"]["episodes"] == 64
     assert "goes on after the 1 blocks" in capsys.readouterr().out
     second = run("--blocks", "2")
-    assert [job[3] for job in calls] == [0, 1, 1]
+    assert [job[4] for job in calls] == [0, 1, 1]
     assert second["total"]["episodes"] == 128
     # Each block has its own starts, and is the same whenever it is run.
     blocks = second["blocks"]
@@ -74,21 +75,24 @@ def test_an_interrupted_study_goes_on_and_comes_to_the_same(study, run, monkeypa
 
 def test_captures_are_counted_and_can_be_found_again(study):
     blocks = [
-        {"pursuer": p, "policy": "stay", "block": b, "episodes": 10, "captured": c, "reached": 0,
-         "env_steps": 5, "smallest_distance": d, "corrected_steps": 1, "infeasible_steps": 0,
-         "captures": [], "seconds": 1.0}
+        {"pursuer": p, "policy": "stay", "block": b, "episodes": 10, "captured": c, "collided": 0,
+         "reached": 0, "timed_out": 10 - c, "env_steps": 5, "smallest_distance": d,
+         "smallest_obstacle_distance": None, "corrected_steps": 1, "corrections": 0.5,
+         "infeasible_steps": 0, "lost": {}, "seconds": 1.0}
         for p, b, c, d in (("nash", 0, 2, 0.19), ("nash", 1, 0, 0.21), ("still", 0, 0, 0.2))
     ]  # fmt: skip
     report = study.summary(blocks)
     assert report["total"]["captured"] == 2
     assert report["total"]["smallest_distance"] == 0.19
+    assert report["total"]["smallest_obstacle_distance"] is None
+    assert report["total"]["mean_correction"] == pytest.approx(0.1)
     assert "captured_rate_one_sided_95" not in report["total"]
     assert report["total"]["captured_rate_low"] < 2 / 30 < report["total"]["captured_rate_high"]
     assert [each["episodes"] for each in report["each"]] == [20, 10]
 
 
 def test_the_policies_never_finish_and_do_what_they_are_called(study):
-    scenario = load_scenario("paper", **study.SCENARIO)
+    scenario = load_scenario("paper", **study.STUDIES["game"].fields)
     names = observation_names(scenario)
     assert names[1] == "target_near"
     assert [name.split("_")[1] for name in names[2:4]] == ["x", "y"]
@@ -97,3 +101,12 @@ def test_the_policies_never_finish_and_do_what_they_are_called(study):
     np.testing.assert_array_equal(study._policy("stay")(near), [0.0, 0.0])
     seen = far.at[2:4].set(jnp.array([-0.3, 0.4]))
     np.testing.assert_allclose(study._policy("reckless")(seen), [-0.6, 0.8], rtol=1e-6)
+
+
+def test_the_joint_studies_ask_for_what_they_say(study):
+    joint = study.STUDIES["joint"]
+    assert joint.block * joint.blocks["nash"] == 20_000
+    assert joint.block * joint.other == 5_000
+    three = study.STUDIES["three-obstacles"]
+    assert three.block * three.blocks["nash"] == 5_000
+    assert three.fields["obstacle_count"] == 3
