@@ -10,10 +10,11 @@ LIMIT = 0.1574
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The look-ahead of `joint` takes long to compile: in float64 it is tested by name (`-m slow`)."""
+    """The look-ahead of `joint` takes long to compile, longest in heading mode: that and float64 are tested by name."""
     for item in items:
         parameters = getattr(getattr(item, "callspec", None), "params", {})
-        if parameters.get("name") == "joint" and parameters.get("precision"):
+        heading = "heading" in item.name
+        if parameters.get("name") == "joint" and (parameters.get("precision") or heading):
             item.add_marker(pytest.mark.slow)
 
 
