@@ -10,7 +10,7 @@ LIMIT = 0.1574
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The look-ahead of `joint` takes long to compile, longest in heading mode: that and float64 are tested by name."""
+    """`joint` takes long to compile, longest in heading mode: that and float64 are tested by name."""
     for item in items:
         parameters = getattr(getattr(item, "callspec", None), "params", {})
         heading = "heading" in item.name
