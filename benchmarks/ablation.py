@@ -96,15 +96,13 @@ def one_training(
         options=make_options(**options, hidden=hidden),
     )
     keys = ("episodes", "safe_episodes", "reached", "captured", "collided", "timed_out", "converged_episode",
-            "final_return", "intervention_rate", "env_steps", "wall_seconds")  # fmt: skip
-    corrected = sum(line["mean_correction"] * line["steps"] for line in training.metrics)
+            "final_return", "intervention_rate", "mean_correction", "env_steps", "wall_seconds")  # fmt: skip
     run = {
         "variant": variant,
         "seed": seed,
         "hidden": hidden,
         "shield": shield,
         **{key: training.summary[key] for key in keys},
-        "mean_correction": corrected / sum(line["steps"] for line in training.metrics),
         "outcomes": "".join(line["outcome"][0] for line in training.metrics),
     }
     if evaluated:

@@ -57,8 +57,8 @@ def length(x: Float[AnyArray, "*lanes"], y: Float[AnyArray, "*lanes"]) -> Lanes:
     return jnp.where(long, jnp.sqrt(jnp.where(long, squared, 1.0)), 0.0)
 
 
-def norm(vectors: Float[AnyArray, "..."], axis: int = -1) -> Float[Array, "..."]:
-    """Euclidean length along an axis, with gradient 0 (not NaN) where the length is 0."""
-    squared = jnp.sum(vectors**2, axis=axis)
+def norm(vectors: Float[AnyArray, "... d"]) -> Float[Array, "..."]:
+    """Euclidean length along the last axis, with gradient 0 (not NaN) where the length is 0."""
+    squared = jnp.sum(vectors**2, axis=-1)
     long = squared > 0.0
     return jnp.where(long, jnp.sqrt(jnp.where(long, squared, 1.0)), 0.0)

@@ -10,11 +10,10 @@ LIMIT = 0.1574
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """`joint` takes long to compile, longest in heading mode: that and float64 are tested by name."""
+    """`joint` takes long to compile: in float64 it is tested by name."""
     for item in items:
         parameters = getattr(getattr(item, "callspec", None), "params", {})
-        heading = "heading" in item.name
-        if parameters.get("name") == "joint" and (parameters.get("precision") or heading):
+        if parameters.get("name") == "joint" and parameters.get("precision"):
             item.add_marker(pytest.mark.slow)
 
 

@@ -67,15 +67,14 @@ def test_an_imagined_chase_is_the_chase_that_follows():
     guard = GameShield(scenario, wish_picks_side=True)
     world = scenario.reset(jax.random.key(4))
     ways = jnp.array([[0, 5, 16, 18], [17, 17, 3, 19]], jnp.int32)
-    ages, length, periods = jnp.array([0.0, 0.2]), jnp.asarray(0.5), jnp.full(30, scenario.control_period)
+    ages, length = jnp.array([0.0, 0.2]), jnp.asarray(0.5)
 
     @jax.jit
     def both(world):
         sides = guard.init(world)
         spread = lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, 2, 2))  # noqa: E731
         outlook = imagine(
-            scenario, guard.heed, models, jax.tree.map(spread, world), spread(sides), ways, ages, periods,
-            length, jnp.asarray(0.0),
+            scenario, guard.heed, models, jax.tree.map(spread, world), spread(sides), ways, ages, length, 30
         )  # fmt: skip
 
         def follow(model, way, age):
@@ -108,7 +107,9 @@ def test_an_imagined_chase_is_the_chase_that_follows():
 
 def test_the_time_to_contact_counts_until_the_first_touch():
     """Head-on into an obstacle 0.3 m away at 0.1574 m/s, no pursuer near, rows out of the way."""
-    scenario = load_scenario("paper", obstacle_gain=1e6, pursuer_gain=1e6, obstacle_velocity=[0.0, 0.0])
+    scenario = load_scenario(
+        "paper", obstacle_gain=1e6, pursuer_gain=1e6, obstacle_velocity=[0.0, 0.0], control_period=0.1
+    )
     world = World(
         jnp.zeros(2), jnp.array([[30.0, 0.0, 0.0]]), jnp.array([[0.5, 0.0, 0.0, 0.0]]), jnp.array([2.0, 0.0])
     )
@@ -117,8 +118,7 @@ def test_the_time_to_contact_counts_until_the_first_touch():
     outlook = jax.jit(
         lambda world: imagine(
             scenario, free, (make_pursuer("still"),), jax.tree.map(spread, world), spread(jnp.ones(1)),
-            jnp.zeros((1, STRETCHES), jnp.int32), jnp.zeros(1), jnp.full(60, 0.1), jnp.asarray(1.5),
-            jnp.asarray(0.0),
+            jnp.zeros((1, STRETCHES), jnp.int32), jnp.zeros(1), jnp.asarray(1.5), 60,
         )
     )(world)  # fmt: skip
     assert float(outlook.time[0, 0]) == pytest.approx(1.9, abs=0.11)

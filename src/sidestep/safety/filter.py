@@ -287,7 +287,7 @@ def _closest(
         rank = jnp.maximum(rank, _HARDER * jnp.maximum(_worst(miss, lines, part(rows, 0, hard)), outside))
     key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + rank)
     lowest = jnp.argmin(key, axis=0)
-    chosen = jnp.stack([lowest == index for index in range(key.shape[0])])
+    chosen = lowest == jnp.arange(key.shape[0]).reshape(-1, *[1] * lowest.ndim)
     pick = lambda entry: jnp.sum(jnp.where(chosen, entry, 0.0), axis=0)  # noqa: E731
 
     c = jnp.clip(c, -1.0, 1.0)  # whatever rounding did, the speed limit holds

@@ -82,10 +82,9 @@ class JointShield(Shield):
     the pursuit barrier's value (m) up to which the rows cannot vouch on their own. Clear means `margin` (m)
     away from obstacles, or what there is now if that is less. `pursuer_gain` (1/s) replaces the scenario's:
     a larger one leaves more room to move, and to change sides close to a pursuer's axis. A chase is imagined
-    `fine_steps` of the robot's own control period ahead, 6 s at 20 Hz; then, if there are `coarse_steps`, in
-    these up to `horizon` (s), with `lenience` (m) for how much closer to a pursuer longer periods may come.
-    They cost less and promise too much: an evader that is turned after gains on a pursuer that decides less
-    often. The decision carries no derivatives; the action does.
+    `horizon` (s) ahead in `steps` periods, or in as many of the robot's own where those are longer. Periods
+    longer than the robot's promise too much, because an evader gains on a pursuer that decides less often;
+    `steps` is what a decision costs. The decision carries no derivatives; the action does.
     """
 
     scenario: Scenario
@@ -93,10 +92,8 @@ class JointShield(Shield):
     near_obstacle: Scalar = eqx.field(converter=real, default=0.8)
     near_pursuer: Scalar = eqx.field(converter=real, default=0.5)
     margin: Scalar = eqx.field(converter=real, default=0.02)
-    lenience: Scalar = eqx.field(converter=real, default=0.0)
     horizon: Scalar = eqx.field(converter=real, default=6.0)
-    fine_steps: int = eqx.field(static=True, default=120)
-    coarse_steps: int = eqx.field(static=True, default=0)
+    steps: int = eqx.field(static=True, default=120)
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 
     @property
@@ -202,7 +199,7 @@ class JointShield(Shield):
 
     def _floor(self, world: World) -> Scalar:
         """The clearance (m) that a way out must keep: the margin, or what there is now if that is less."""
-        now = clearance(self.scenario, world, self.lenience)
+        now = clearance(self.scenario, world)
         return jnp.clip(now - _GIVE, 0.0, self.margin)
 
     def _search(self, situation: _Situation) -> _Decision:
@@ -239,18 +236,16 @@ class JointShield(Shield):
     def _imagine(self, worlds: World, sides: Any, ways: Any, ages: Any) -> Outlook:
         models: tuple[Pursuer, ...] = tuple(make_pursuer(name) for name in self.models)
         all_sides = jnp.broadcast_to(sides[:, None, None], (*sides.shape, len(models), len(ways)))
-        fine = jnp.broadcast_to(self.scenario.control_period, self.fine_steps)
-        rest = jnp.maximum(self.horizon - jnp.sum(fine), 0.0) / max(self.coarse_steps, 1)
-        periods = jnp.concatenate([fine, jnp.broadcast_to(rest, self.coarse_steps)])
+        period = jnp.maximum(self.scenario.control_period, self.horizon / self.steps)
+        paced = eqx.tree_at(lambda scenario: scenario.control_period, self.scenario, period)
         return imagine(
-            self.scenario,
+            paced,
             self._game.heed,
             models,
             worlds,
             all_sides,
             ways,
             ages,
-            periods,
             self.horizon / STRETCHES,
-            self.lenience,
+            self.steps,
         )

@@ -15,6 +15,10 @@ from jaxtyping import Array, Float
 
 from sidestep._arrays import Lanes
 
+_STACKED = 4
+"""Up to so many rows groups of them are stacked row by row, which XLA fuses with what follows; it compiles for
+minutes where there are thousands of groups."""
+
 
 class Rows(NamedTuple):
     """Rows n.u >= c with unit normals n = (x, y); a row with n = 0 stands for no row at all."""
@@ -85,7 +89,12 @@ def _disc_level(rows: Rows, first: int) -> Lanes:
 
 def _take(rows: Rows, groups: Sequence[tuple[int, ...]]) -> list[Rows]:
     """The first rows of all groups, the second ones, and so on."""
-    pick = lambda entry, index: jnp.stack([entry[i] for i in index])  # noqa: E731
+
+    def pick(entry: Array, index: tuple[int, ...]) -> Array:
+        if rows.c.shape[0] > _STACKED:
+            return entry[np.array(index)]
+        return jnp.stack([entry[i] for i in index])
+
     return [Rows(*(pick(entry, index) for entry in rows)) for index in zip(*groups, strict=True)]
 
 
@@ -169,6 +178,6 @@ def _circle_level(rows: Rows, first: int) -> Lanes:
     level = jnp.max(violation[:, first:], axis=1)
     key = jnp.where(on_circle, jnp.where(excess <= 64.0 * eps, level, 8.0 + excess), jnp.inf)
     lowest = jnp.argmin(key, axis=0)
-    best = jnp.stack([lowest == index for index in range(key.shape[0])])
+    best = lowest == jnp.arange(key.shape[0]).reshape(-1, *[1] * lowest.ndim)
     # With no action on the circle (every row void) nothing can be violated.
     return jnp.where(jnp.any(on_circle, axis=0), jnp.sum(jnp.where(best, level, 0.0), axis=0), 0.0)

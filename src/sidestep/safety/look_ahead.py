@@ -61,17 +61,13 @@ def stretch(way: WayOut, age: Scalar, length: Scalar) -> Count:
     return way[jnp.clip((age / length).astype(jnp.int32), 0, STRETCHES - 1)]
 
 
-def clearance(scenario: Scenario, world: World, lenience: Scalar) -> Lanes:
-    """Distance (m) left before the evader collides or is captured; negative in contact.
-
-    Captures are the rows' business, and a chase imagined in longer periods than the robot's makes them a
-    little worse than they are: `lenience` (m) is added to the distance to pursuers.
-    """
+def clearance(scenario: Scenario, world: World) -> Lanes:
+    """Distance (m) left before the evader collides or is captured; negative in contact."""
     x, y = world.evader[0], world.evader[1]
     to_pursuers = length(world.pursuers[:, 0] - x, world.pursuers[:, 1] - y)
     to_obstacles = length(world.obstacles[:, 0] - x, world.obstacles[:, 1] - y)
     return jnp.minimum(
-        jnp.min(to_pursuers - scenario.capture_distance + lenience, axis=0, initial=jnp.inf),
+        jnp.min(to_pursuers - scenario.capture_distance, axis=0, initial=jnp.inf),
         jnp.min(to_obstacles - scenario.collision_distance, axis=0, initial=jnp.inf),
     )
 
@@ -92,35 +88,34 @@ def imagine(
     sides: Float[Array, "m models n"],
     ways: Int[Array, "n stretches"],
     ages: Float[Array, "n"],
-    periods: Float[Array, "steps"],
     length: Scalar,
-    lenience: Scalar,
+    steps: int,
 ) -> Outlook:
-    """What becomes of ways out when they are followed.
+    """What becomes of ways out when they are followed for `steps` of the scenario's control periods.
 
     **Arguments:** `guard(world, wish, sides) -> (action, sides)`, the rows; `worlds` and `sides` with axes
     (models, n) behind their own, model i driving the pursuers of `worlds[..., i, :]`; `ways` the way out
-    followed in each, `ages` how long (s) it has been followed already, `length` of its stretches (s);
-    `periods` the periods (s) to imagine, one by one; `lenience` see `clearance`.
+    followed in each, `ages` how long (s) it has been followed already, `length` of its stretches (s).
     """
     key = jax.random.key(0)  # the models do not draw
     lanes = (len(models), len(ways))
 
-    def step(carry: Any, period: Scalar) -> tuple[Any, None]:
+    period = scenario.control_period
+
+    def step(carry: Any, _: None) -> tuple[Any, None]:
         worlds, sides, ages, outlook = carry
-        paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, period)
         numbers = jax.vmap(stretch, in_axes=(0, 0, None))(ways, ages, length)
         wished = wish(scenario, worlds, sides, jnp.broadcast_to(numbers, lanes))
         actions, sides = guard(worlds, wished, sides)
         each = [jax.tree.map(lambda leaf, i=i: leaf[..., i, :], worlds) for i in range(len(models))]
         wheels = jnp.stack(
-            [pursue(paced, model, world, key) for model, world in zip(models, each, strict=True)], axis=-2
+            [pursue(scenario, model, world, key) for model, world in zip(models, each, strict=True)], axis=-2
         )
-        worlds = paced.moved(worlds, actions, wheels)
-        least = jnp.minimum(outlook.least, clearance(scenario, worlds, lenience))
+        worlds = scenario.moved(worlds, actions, wheels)
+        least = jnp.minimum(outlook.least, clearance(scenario, worlds))
         time = outlook.time + jnp.where(least > 0.0, period, 0.0)
         return (worlds, sides, ages + period, Outlook(time, least)), None
 
     begin = Outlook(jnp.zeros(lanes, ages.dtype), jnp.full(lanes, jnp.inf, ages.dtype))
-    (_, _, _, outlook), _ = jax.lax.scan(step, (worlds, sides, ages, begin), periods)
+    (_, _, _, outlook), _ = jax.lax.scan(step, (worlds, sides, ages, begin), length=steps)
     return outlook

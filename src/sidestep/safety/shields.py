@@ -197,22 +197,22 @@ class GameShield(Shield):
     ) -> tuple[ShieldResult, Any]:
         if self.known_velocity:
             return self._over_period(world, nominal, memory)
-        kept, m = guarded(self.scenario), self.scenario.pursuer_count
-        memory = self._sides(kept, world, nominal, memory)
-        rows = _with_obstacles(self._barrier, kept, world, memory)
+        m = self.scenario.pursuer_count
+        rows, memory = self._kept_rows(world, nominal, memory)
         values = rows.values.at[:m].add(sampling_margin(self.scenario)).at[m:].add(TOUCH)
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
         return _decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
 
-    @property
-    def _barrier(self) -> PursuitBarrier:
-        """Where the margin has been used up the row still holds what is left, and asks for no more."""
-        return PursuitBarrier(eased=sampling_margin(self.scenario))
-
-    def _sides(self, kept: Scenario, world: World, wish: Any, memory: Any) -> Float[Array, "m *lanes"]:
+    def _kept_rows(self, world: World, wish: Any, memory: Any) -> tuple[BarrierRows, Any]:
+        """The rows at the distances that are kept, and the sides of the pursuers' axes that they follow."""
+        kept = guarded(self.scenario)
+        # Where the margin has been used up the row still holds what is left, and asks for no more.
+        barrier = PursuitBarrier(eased=sampling_margin(self.scenario))
         if self.wish_picks_side:
-            return self._barrier.prefer(kept, world, memory, wish)
-        return self._barrier.remember(kept, world, memory)
+            memory = barrier.prefer(kept, world, memory, wish)
+        else:
+            memory = barrier.remember(kept, world, memory)
+        return _with_obstacles(barrier, kept, world, memory), memory
 
     def heed(
         self, world: World, wish: Float[Array, "2 *lanes"], memory: Float[Array, "m *lanes"]
@@ -222,16 +222,14 @@ class GameShield(Shield):
         The same as calling the shield, without what it takes to be sure of its input and to report: for
         chases that are only imagined.
         """
-        kept = guarded(self.scenario)
-        memory = self._sides(kept, world, wish, memory)
-        rows = _with_obstacles(self._barrier, kept, world, memory)
+        rows, memory = self._kept_rows(world, wish, memory)
         action = project_known(
             wish,
             rows.normals,
             rows.offsets,
-            kept.evader_speed,
-            hard=kept.pursuer_count,
-            circle=kept.action == "heading",
+            self.scenario.evader_speed,
+            hard=self.scenario.pursuer_count,
+            circle=self.scenario.action == "heading",
         )
         return action, memory
 

@@ -13,7 +13,7 @@ import numpy as np
 import sidestep
 from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
-from sidestep.safety import Status, make_shield
+from sidestep.safety import SHIELDS, Status, make_shield
 from sidestep.trials.captures import examine_captures
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import GOAL_SEEKING
@@ -32,9 +32,6 @@ PAPER: dict[str, Any] = {
     "scene_trained": {"outcome": "reached"},
 }
 """What the paper reports (section IV and its Table I), under the names of our own figures."""
-
-SHIELDS = ("none", "paper", "game", "joint")
-"""The shields that a study compares unless told otherwise: each adds to the one before it."""
 
 Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
 """Opens a progress display for a labelled part: a context manager that gives a callable."""
@@ -113,7 +110,7 @@ def reproduce(
     out: str | Path,
     *,
     scenario: Scenario | None = None,
-    shields: Sequence[str] = SHIELDS,
+    shields: Sequence[str] = tuple(SHIELDS),
     pursuer: str = "nash",
     seed: int = 0,
     episodes: int = 200,
