@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from sidestep._arrays import Lanes
 
 _STACKED = 4
-"""Up to so many rows groups of them are stacked row by row, which XLA fuses with what follows; it compiles for
-minutes where there are thousands of groups."""
+"""Up to so many rows groups of them are stacked row by row, which XLA fuses with what follows. With thousands
+of groups it would compile for minutes."""
 
 
 class Rows(NamedTuple):
