@@ -170,6 +170,73 @@ def test_whatever_is_driven_has_passed_the_pursuers_row(decided):
     assert np.mean(np.asarray(memory.way) != WISHES - 1) > 0.2
 
 
+@pytest.fixture(scope="module")
+def chased():
+    """A joint shield with the memory of a chase by a pursuer that never lets go, period by period."""
+    scenario = load_scenario("paper", obstacle_starts=[[0.35, 0.45]], obstacle_velocity=[0.0, 0.0])
+    shield, driver = JointShield(scenario), make_pursuer("turn-then-drive")
+    start = World(
+        jnp.zeros(2),
+        jnp.array([[-0.35, 0.0, 0.0]]),
+        jnp.array([[0.35, 0.45, 0.0, 0.0]]),
+        jnp.array([1.0, 0.0]),
+    )
+
+    @jax.jit
+    def chase(world):
+        def period(carry, _):
+            world, memory = carry
+            result, later = shield(world, 0.15 * (world.target - world.evader), memory)
+            wheels = pursue(scenario, driver, world, jax.random.key(0))
+            return (scenario.step(world, result.action, wheels)[0], later), (world, memory, later, result)
+
+        return jax.lax.scan(period, (world, shield.init(world)), length=160)[1]
+
+    return scenario, shield, chase(start)
+
+
+def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_while(chased):
+    scenario, _, (_, before, after, _) = chased
+    period = float(scenario.control_period)
+    waits = np.asarray(before.pause) > 1e-6
+    assert 5 <= waits.sum() < len(waits)
+    assert not np.any(np.asarray(before.counts)[waits])
+    same = np.all(np.asarray(before.way == after.way), axis=-1)
+    left = np.asarray(before.pause - after.pause)
+    # Either the pause goes on with the same way, or it is over: something else was found, or nobody is near.
+    goes_on = waits & np.isclose(left, period, atol=1e-5)
+    assert goes_on.sum() >= 5
+    assert np.all(same[goes_on])
+    assert np.asarray(after.pause).max() <= 0.5 - period + 1e-6
+
+
+def test_an_action_is_accepted_only_if_what_it_leads_to_is_clear():
+    """The period in which the action itself is driven counts, not only the way out after it."""
+    scenario = load_scenario("paper", obstacle_gain=3.0)
+    shield = JointShield(scenario, models=("turn-then-drive",))
+    away, act = np.pi / 8.0 * 3.0, eqx.filter_jit(shield)
+    ahead = jnp.array([-np.cos(away), -np.sin(away)], float)
+    for gap, accepted in ((0.3, True), (0.018, False)):
+        place = (scenario.collision_distance + gap) * ahead
+        world = World(
+            jnp.zeros(2),
+            jnp.array([[0.6, 0.0, 0.0]]),
+            jnp.concatenate([place, jnp.zeros(2)])[None],
+            jnp.array([-1.0, 0.0]),
+        )
+        # The way out makes good in its first period what the action, straight at the obstacle, loses.
+        memory = eqx.tree_at(
+            lambda m: (m.counts, m.way),
+            shield.init(world),
+            (jnp.asarray(True), jnp.full(STRETCHES, 3, jnp.int32)),
+        )
+        greedy, _ = eqx.filter_jit(shield.rows_only)(world, 0.157 * ahead, memory.sides)
+        lost = 0.05 * float(greedy.action @ ahead)
+        assert lost > 0.0011, "rows that already refuse would prove little"
+        result, _ = act(world, 0.157 * ahead, memory)
+        assert bool(jnp.all(result.action == greedy.action)) == accepted
+
+
 def test_alone_a_robot_decides_as_it_does_in_a_batch(decided):
     _, shield, worlds, nominal, (result, memory) = decided
     act = eqx.filter_jit(lambda world, nominal: shield(world, nominal, shield.init(world)))

@@ -38,7 +38,10 @@ def test_pursuers_and_motion(name):
     def move(world, velocity):
         return scenario.moved(world, velocity, pursue(scenario, pursuer, world, key))
 
-    _close(jax.jit(move)(_in_lanes(worlds), _in_lanes(velocity)), _in_lanes(jax.vmap(move)(worlds, velocity)))
+    _close(
+        jax.jit(move)(_in_lanes(worlds), _in_lanes(velocity)),
+        _in_lanes(jax.jit(jax.vmap(move))(worlds, velocity)),
+    )
 
 
 @pytest.mark.parametrize("fields", [{}, {"action": "heading"}, {"pursuer_count": 2, "obstacle_count": 3}])
@@ -76,5 +79,5 @@ def test_filter_with_more_rows_than_can_be_kept(hard, circle):
     together = jax.jit(solve)(wish, normals, offsets)
     _close(together, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), each))
     assert 20 < np.sum(np.asarray(together.status) == Status.INFEASIBLE) < lanes - 20
-    known = project_known(wish, normals, offsets, jnp.ones(()), hard=hard, circle=circle)
-    _close(known, together.action)
+    known = jax.jit(lambda *rows: project_known(*rows, jnp.ones(()), hard=hard, circle=circle))
+    _close(known(wish, normals, offsets), together.action)

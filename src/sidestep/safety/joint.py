@@ -24,32 +24,37 @@ _VARIANTS = 12
 _FORGET = 0.9
 _SURPRISED = 0.1
 _GIVE = 0.001
+_PAUSE = 0.5
 
 
 class JointMemory(eqx.Module):
     """What the shield keeps in mind.
 
-    `sides (m,)` of the pursuit barrier; `way (stretches,)` the way out that it counts on, if `counts`;
-    `expected (models, m, 2)` the wheel speeds (m/s) that each model would have driven last, and `surprise
-    (models,)` by how much it was wrong of late, as a share of the wheel speed; `calls ()` so far.
+    `sides (m,)` of the pursuit barrier; `way (stretches,)` the way out that it counts on, if `counts`,
+    followed for `age` (s); `pause` the time (s) for which no other is sought; `expected (models, m, 2)` the
+    wheel speeds (m/s) that each model would have driven last, and `surprise (models,)` by how much it was
+    wrong of late, as a share of the wheel speed; `calls ()` so far.
     """
 
     sides: Float[Array, "m"]
     way: Int[Array, "stretches"]
     age: Scalar
     counts: Flag
+    pause: Scalar
     expected: Float[Array, "models m 2"]
     surprise: Float[Array, "models"]
     calls: Int[Array, ""]
 
 
 class _Decision(eqx.Module):
-    """`accept` the nominal action, or else follow `way`; whether that way out is `clear`."""
+    """`accept` the nominal action, or else follow `way`; whether that way out is `clear`, or for how long
+    (s) no other need be sought while it comes to no contact."""
 
     accept: Flag
     way: Int[Array, "stretches"]
     age: Scalar
     clear: Flag
+    pause: Scalar
 
 
 class _Situation(eqx.Module):
@@ -60,6 +65,8 @@ class _Situation(eqx.Module):
     sides: Float[Array, "m"]
     way: Int[Array, "stretches"]
     age: Scalar
+    counts: Flag
+    pause: Scalar
     wheels: Float[Array, "models m 2"]
     live: Array
     key: PRNGKeyArray
@@ -73,7 +80,9 @@ class JointShield(Shield):
     of pursuers and obstacles for the whole horizon against every pursuer of `models`. Else a new one is
     sought among all constant wishes and random variations of the old one: of those that stay clear against
     all, the one whose first wish is closest to the action; if there is none, the one that stays clear
-    longest, first against those models that drive as the pursuers have been seen to, then against all.
+    longest, first against those models that drive as the pursuers have been seen to, then against all. If
+    that one touches nothing within the horizon, and only keeps less than the margin, it is followed for half
+    a second, as long as that stays true, before another is sought.
 
     Whatever is driven has passed the rows of `game`, pursuers first: what holds for that shield holds for
     this one too. What the look-ahead adds towards obstacles is measured, not proved.
@@ -112,6 +121,7 @@ class JointShield(Shield):
             way=jnp.full(STRETCHES, WISHES - 1, jnp.int32),
             age=jnp.zeros_like(world.time),
             counts=jnp.zeros((), bool),
+            pause=jnp.zeros_like(world.time),
             expected=jnp.broadcast_to(world.wheel_speeds, (count, m, 2)),
             surprise=jnp.zeros(count, world.evader.dtype),
             calls=jnp.zeros((), jnp.int32),
@@ -145,11 +155,13 @@ class JointShield(Shield):
             sides,
             memory.way,
             memory.age,
+            memory.counts,
+            memory.pause,
             wheels,
             live,
             jax.random.fold_in(key, memory.calls),
         )
-        decision = self._look(need, memory.counts, situation)
+        decision = self._look(need, situation)
 
         length = self.horizon / STRETCHES
         chosen = wish(self.scenario, world, sides, stretch(decision.way, decision.age, length))
@@ -167,35 +179,50 @@ class JointShield(Shield):
             decision.way,
             decision.age + self.scenario.control_period,
             need & decision.clear,
+            jnp.where(need, decision.pause - self.scenario.control_period, 0.0),
             wheels,
             surprise,
             memory.calls + 1,
         )
 
-    def _look(self, need: Flag, counts: Flag, situation: _Situation) -> _Decision:
+    def _look(self, need: Flag, situation: _Situation) -> _Decision:
         """Whether the action may be taken, and the way out counted on or to be taken instead."""
+        known = situation.counts | (situation.pause > 0.0)
         arrays, fixed = eqx.partition(self, eqx.is_array)
         arrays, situation = jax.lax.stop_gradient((arrays, situation))
-        idle = _Decision(~need, situation.way, situation.age, jnp.zeros((), bool))
+        nothing = jnp.zeros_like(situation.pause)
+        idle = _Decision(~need, situation.way, situation.age, jnp.zeros((), bool), nothing)
 
         def confirm(arrays: Any, situation: _Situation) -> _Decision:
-            clear = eqx.combine(arrays, fixed)._confirm(situation)
-            return _Decision(clear, situation.way, situation.age, clear)
+            holds = eqx.combine(arrays, fixed)._confirm(situation)
+            clear = holds & situation.counts
+            pause = jnp.where(holds & ~clear, situation.pause, 0.0)
+            return _Decision(clear, situation.way, situation.age, clear, pause)
 
         def search(arrays: Any, situation: _Situation) -> _Decision:
             return eqx.combine(arrays, fixed)._search(situation)
 
-        quick = by_need(confirm, need & counts, idle, arrays, situation, width=4)
-        return by_need(search, ~quick.accept, quick, arrays, situation, width=1)
+        quick = by_need(confirm, need & known, idle, arrays, situation, width=4)
+        seek = ~quick.accept & (quick.pause <= 0.0)
+        return by_need(search, seek, quick, arrays, situation, width=1)
 
     def _confirm(self, situation: _Situation) -> Flag:
-        """Whether the way out counted on stays clear after the action, whichever model drives."""
+        """Whether the way out counted on stays clear after the action, whichever model drives; or, if none
+        is counted on, whether the one that is followed still comes to no contact."""
+        now = situation.world
         after = [
-            self.scenario.step(situation.world, situation.action, wheels)[0] for wheels in situation.wheels
+            jax.tree.map(
+                lambda a, b: jnp.where(situation.counts, a, b),
+                self.scenario.step(now, situation.action, wheels)[0],
+                now,
+            )
+            for wheels in situation.wheels
         ]
         worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1)[..., None], *after)
         outlook = self._imagine(worlds, situation.sides, situation.way[None], situation.age[None])
-        return jnp.min(outlook.least) >= self._floor(situation.world)
+        # Where the action itself leads counts too.
+        least = jnp.minimum(jnp.min(outlook.least), jnp.min(clearance(self.scenario, worlds)))
+        return jnp.where(situation.counts, least >= self._floor(now), least > 0.0)
 
     def _floor(self, world: World) -> Scalar:
         """The clearance (m) that a way out must keep: the margin, or what there is now if that is less."""
@@ -219,7 +246,8 @@ class JointShield(Shield):
             situation.world,
         )
         outlook = self._imagine(worlds, situation.sides, ways, ages)
-        clear = jnp.min(outlook.least, axis=0) >= self._floor(situation.world)
+        least = jnp.min(outlook.least, axis=0)
+        clear = least >= self._floor(situation.world)
         likely = jnp.min(jnp.where(situation.live[:, None], outlook.time, jnp.inf), axis=0)
         always = jnp.min(outlook.time, axis=0)
         first = jax.vmap(lambda number: wish(self.scenario, situation.world, situation.sides, number))(
@@ -229,9 +257,10 @@ class JointShield(Shield):
         best = jnp.where(
             jnp.any(clear),
             jnp.argmin(jnp.where(clear, correction, jnp.inf)),
-            jnp.argmax(100.0 * likely + always + jnp.min(outlook.least, axis=0)),
+            jnp.argmax(100.0 * likely + always + least),
         )
-        return _Decision(jnp.zeros((), bool), ways[best], ages[best], jnp.any(clear))
+        pause = jnp.where((least[best] > 0.0) & ~clear[best], _PAUSE, 0.0).astype(least.dtype)
+        return _Decision(jnp.zeros((), bool), ways[best], ages[best], clear[best], pause)
 
     def _imagine(self, worlds: World, sides: Any, ways: Any, ages: Any) -> Outlook:
         models: tuple[Pursuer, ...] = tuple(make_pursuer(name) for name in self.models)
