@@ -207,7 +207,7 @@ def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_whi
     goes_on = waits & np.isclose(left, period, atol=1e-5)
     assert goes_on.sum() >= 5
     assert np.all(same[goes_on])
-    assert np.asarray(after.pause).max() <= 0.5 - period + 1e-6
+    assert np.asarray(after.pause).max() <= 0.15 - period + 1e-6
 
 
 def test_an_action_is_accepted_only_if_what_it_leads_to_is_clear():

@@ -24,7 +24,7 @@ _VARIANTS = 12
 _FORGET = 0.9
 _SURPRISED = 0.1
 _GIVE = 0.001
-_PAUSE = 0.5
+_PAUSE = 0.15
 
 
 class JointMemory(eqx.Module):
@@ -81,8 +81,8 @@ class JointShield(Shield):
     sought among all constant wishes and random variations of the old one: of those that stay clear against
     all, the one whose first wish is closest to the action; if there is none, the one that stays clear
     longest, first against those models that drive as the pursuers have been seen to, then against all. If
-    that one touches nothing within the horizon, and only keeps less than the margin, it is followed for half
-    a second, as long as that stays true, before another is sought.
+    that one touches nothing within the horizon, and only keeps less than the margin, it is followed for
+    0.15 s, as long as that stays true, before another is sought.
 
     Whatever is driven has passed the rows of `game`, pursuers first: what holds for that shield holds for
     this one too. What the look-ahead adds towards obstacles is measured, not proved.
