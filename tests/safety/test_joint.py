@@ -170,9 +170,8 @@ def test_whatever_is_driven_has_passed_the_pursuers_row(decided):
     assert np.mean(np.asarray(memory.way) != WISHES - 1) > 0.2
 
 
-@pytest.fixture(scope="module")
-def chased():
-    """A joint shield with the memory of a chase by a pursuer that never lets go, period by period."""
+def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_while():
+    """In a chase by a pursuer that never lets go; the memory before and after every period is looked at."""
     scenario = load_scenario("paper", obstacle_starts=[[0.35, 0.45]], obstacle_velocity=[0.0, 0.0])
     shield, driver = JointShield(scenario), make_pursuer("turn-then-drive")
     start = World(
@@ -188,15 +187,11 @@ def chased():
             world, memory = carry
             result, later = shield(world, 0.15 * (world.target - world.evader), memory)
             wheels = pursue(scenario, driver, world, jax.random.key(0))
-            return (scenario.step(world, result.action, wheels)[0], later), (world, memory, later, result)
+            return (scenario.step(world, result.action, wheels)[0], later), (memory, later)
 
         return jax.lax.scan(period, (world, shield.init(world)), length=160)[1]
 
-    return scenario, shield, chase(start)
-
-
-def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_while(chased):
-    scenario, _, (_, before, after, _) = chased
+    before, after = chase(start)
     period = float(scenario.control_period)
     waits = np.asarray(before.pause) > 1e-6
     assert 5 <= waits.sum() < len(waits)

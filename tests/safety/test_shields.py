@@ -137,7 +137,7 @@ def _scene_at(x):
 def test_head_on_the_papers_shield_is_lost_where_the_games_is_not(precision):
     """h_pv < (V - v_e)/gamma = 0.0355 m straight ahead: the paper's row is infeasible, the game's is kept."""
     world = _scene(pursuers=(0.2 + 0.03, 0.0, np.pi), obstacles=(0.0, 20.0, 0.0, 0.0))
-    paper, game = (_shield(name, load_scenario("paper")) for name in ("paper", "game"))
+    paper, game = (make_shield(name, load_scenario("paper")) for name in ("paper", "game"))
     assert _call(paper, world, [0.1, 0.0]).status == Status.INFEASIBLE
     np.testing.assert_allclose(_call(paper, world, [0.1, 0.0]).action, [-0.1574, 0.0], atol=1e-4)
     # The tip of the capture set is at l/rho = 0.2541 m; just outside it the game's row still holds.
@@ -236,7 +236,7 @@ def test_a_shield_is_accepted_in_place_of_its_name():
 def _captures(name, pursuer, episodes=256, seconds=30.0, **options):
     """Captures, collisions and smallest pursuer clearance of episodes that head straight for the target."""
     scenario = load_scenario("paper", obstacle_count=0, **options)
-    shield, chaser = _shield(name, scenario), make_pursuer(pursuer)
+    shield, chaser = make_shield(name, scenario), make_pursuer(pursuer)
 
     def step(carry, key):
         world, memory, over, captured, least = carry
