@@ -58,15 +58,13 @@ class _Decision(eqx.Module):
 
 
 class _Situation(eqx.Module):
-    """What a decision is made from."""
+    """What a decision is made from: the `action` that the rows let through, the `sides` that they follow for
+    it, and the `wheels` (m/s) that each model would drive now."""
 
     world: World
+    memory: JointMemory
     action: Float[Array, "2"]
     sides: Float[Array, "m"]
-    way: Int[Array, "stretches"]
-    age: Scalar
-    counts: Flag
-    pause: Scalar
     wheels: Float[Array, "models m 2"]
     live: Array
     key: PRNGKeyArray
@@ -101,8 +99,8 @@ class JointShield(Shield):
     near_obstacle: Scalar = eqx.field(converter=real, default=0.8)
     near_pursuer: Scalar = eqx.field(converter=real, default=0.5)
     margin: Scalar = eqx.field(converter=real, default=0.02)
-    horizon: Scalar = eqx.field(converter=real, default=6.0)
-    steps: int = eqx.field(static=True, default=120)
+    horizon: Scalar = eqx.field(converter=real, default=8.0)
+    steps: int = eqx.field(static=True, default=160)
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 
     @property
@@ -150,16 +148,7 @@ class JointShield(Shield):
         key = jax.random.key(0)
         wheels = jnp.stack([pursue(self.scenario, model, world, key) for model in models])
         situation = _Situation(
-            world,
-            greedy.action,
-            sides,
-            memory.way,
-            memory.age,
-            memory.counts,
-            memory.pause,
-            wheels,
-            live,
-            jax.random.fold_in(key, memory.calls),
+            world, memory, greedy.action, sides, wheels, live, jax.random.fold_in(key, memory.calls)
         )
         decision = self._look(need, situation)
 
@@ -187,17 +176,19 @@ class JointShield(Shield):
 
     def _look(self, need: Flag, situation: _Situation) -> _Decision:
         """Whether the action may be taken, and the way out counted on or to be taken instead."""
-        known = situation.counts | (situation.pause > 0.0)
         arrays, fixed = eqx.partition(self, eqx.is_array)
         arrays, situation = jax.lax.stop_gradient((arrays, situation))
-        nothing = jnp.zeros_like(situation.pause)
-        idle = _Decision(~need, situation.way, situation.age, jnp.zeros((), bool), nothing)
+        memory = situation.memory
+        known = memory.counts | (memory.pause > 0.0)
+        nothing = jnp.zeros_like(memory.pause)
+        idle = _Decision(~need, memory.way, memory.age, jnp.zeros((), bool), nothing)
 
         def confirm(arrays: Any, situation: _Situation) -> _Decision:
             holds = eqx.combine(arrays, fixed)._confirm(situation)
-            clear = holds & situation.counts
-            pause = jnp.where(holds & ~clear, situation.pause, 0.0)
-            return _Decision(clear, situation.way, situation.age, clear, pause)
+            memory = situation.memory
+            clear = holds & memory.counts
+            pause = jnp.where(holds & ~clear, memory.pause, 0.0)
+            return _Decision(clear, memory.way, memory.age, clear, pause)
 
         def search(arrays: Any, situation: _Situation) -> _Decision:
             return eqx.combine(arrays, fixed)._search(situation)
@@ -209,20 +200,20 @@ class JointShield(Shield):
     def _confirm(self, situation: _Situation) -> Flag:
         """Whether the way out counted on stays clear after the action, whichever model drives; or, if none
         is counted on, whether the one that is followed still comes to no contact."""
-        now = situation.world
+        now, memory = situation.world, situation.memory
         after = [
             jax.tree.map(
-                lambda a, b: jnp.where(situation.counts, a, b),
+                lambda a, b: jnp.where(memory.counts, a, b),
                 self.scenario.step(now, situation.action, wheels)[0],
                 now,
             )
             for wheels in situation.wheels
         ]
         worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1)[..., None], *after)
-        outlook = self._imagine(worlds, situation.sides, situation.way[None], situation.age[None])
+        outlook = self._imagine(worlds, situation.sides, memory.way[None], memory.age[None])
         # Where the action itself leads counts too.
         least = jnp.minimum(jnp.min(outlook.least), jnp.min(clearance(self.scenario, worlds)))
-        return jnp.where(situation.counts, least >= self._floor(now), least > 0.0)
+        return jnp.where(memory.counts, least >= self._floor(now), least > 0.0)
 
     def _floor(self, world: World) -> Scalar:
         """The clearance (m) that a way out must keep: the margin, or what there is now if that is less."""
@@ -230,16 +221,17 @@ class JointShield(Shield):
         return jnp.clip(now - _GIVE, 0.0, self.margin)
 
     def _search(self, situation: _Situation) -> _Decision:
+        memory = situation.memory
         choice_key, wish_key = jax.random.split(situation.key)
         constant = jnp.broadcast_to(jnp.arange(WISHES, dtype=jnp.int32)[:, None], (WISHES, STRETCHES))
         shape = (_VARIANTS, STRETCHES)
         length = self.horizon / STRETCHES
-        starts = situation.age + length * jnp.arange(STRETCHES).astype(length.dtype)
-        rest = jax.vmap(stretch, in_axes=(None, 0, None))(situation.way, starts, length)
+        starts = memory.age + length * jnp.arange(STRETCHES).astype(length.dtype)
+        rest = jax.vmap(stretch, in_axes=(None, 0, None))(memory.way, starts, length)
         other = jax.random.randint(wish_key, shape, 0, WISHES, jnp.int32)
         variants = jnp.where(jax.random.bernoulli(choice_key, 0.5, shape), other, rest)
-        ways = jnp.concatenate([situation.way[None], constant, variants])
-        ages = jnp.zeros(len(ways), length.dtype).at[0].set(situation.age)
+        ways = jnp.concatenate([memory.way[None], constant, variants])
+        ages = jnp.zeros(len(ways), length.dtype).at[0].set(memory.age)
         count = len(self.models)
         worlds = jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, count, len(ways))),
