@@ -70,13 +70,13 @@ lock: ## Write requirements.lock anew after a change of dependencies (make lock 
 docs: $(READY) ## Build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
-bench: $(BENCH_READY) ## Time the training loop against Stable-Baselines3
-	$(BENCH_PY) benchmarks/learning.py $(ARGS)
+bench: $(BENCH_READY) ## Measure ours and the peers, 15 minutes (one section: make bench ARGS=filter)
+	$(BENCH_VENV)/bin/sidestep bench --json benchmarks/results/bench.json --figures runs/bench $(ARGS)
 
-# An environment of its own keeps PyTorch out of the main one. PyTorch goes first, in one exact version, so
-# that nothing later pulls in another build of it.
+# An environment of its own keeps PyTorch and the peers out of the main one. PyTorch goes first, in one exact
+# version, so that nothing later pulls in another build of it.
 $(BENCH_READY): requirements.lock pyproject.toml | $(READY)
-	@echo "Creating $(BENCH_VENV) with PyTorch and Stable-Baselines3 (about 1 GB)"
+	@echo "Creating $(BENCH_VENV) with PyTorch and the peers (about 2 GB)"
 	@$(PY) -m venv --clear $(BENCH_VENV)
 	@$(BENCH_PY) $(PIP_INSTALL) $(TORCH)
 	@$(BENCH_PY) $(PIP_INSTALL) --require-hashes -r requirements.lock

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from sidestep.commands import certify, evaluate, falsify, report, reproduce, train
+from sidestep.commands import bench, certify, evaluate, falsify, report, reproduce, train
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
@@ -18,6 +18,7 @@ _RUN: dict[type, Callable[..., int]] = {
     certify.Certify: certify.run,
     falsify.Falsify: falsify.run,
     report.Report: report.run,
+    bench.Bench: bench.run,
 }
 
 
@@ -29,7 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[reproduce.Reproduce, subcommand("reproduce")]
         | Annotated[certify.Certify, subcommand("certify")]
         | Annotated[falsify.Falsify, subcommand("falsify")]
-        | Annotated[report.Report, subcommand("report")],
+        | Annotated[report.Report, subcommand("report")]
+        | Annotated[bench.Bench, subcommand("bench")],
         prog="sidestep",
         description="Safe reinforcement learning for a robot that is being pursued.",
         args=arguments,

@@ -1,26 +1,13 @@
 """The benchmark's peer: does it learn the same task as ours, so that the comparison means something?"""
 
-import importlib.util
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
+from sidestep.bench.peer_task import PeerTask
 from sidestep.pursuit import make_pursuer
 from sidestep.world import World, load_scenario, observe, scenario_to_dict, to_velocity
-
-PATH = Path(__file__).parents[2] / "benchmarks" / "peer_task.py"
-
-
-@pytest.fixture(scope="module")
-def peer_task():
-    spec = importlib.util.spec_from_file_location("peer_task", PATH)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.PeerTask
 
 
 @eqx.filter_jit
@@ -30,12 +17,12 @@ def our_period(scenario, world, velocity):
     return moved, events, observe(scenario, moved)
 
 
-def test_peer_moves_sees_and_scores_as_we_do(peer_task, x64):
+def test_peer_moves_sees_and_scores_as_we_do(x64):
     scenario = load_scenario("paper")
     constants = scenario_to_dict(scenario)
     constants.update(evader_speed=0.1574, pursuer_speed=0.2)
     scenario = load_scenario("paper", **constants)
-    task = peer_task(constants, hold=1, seed=3)
+    task = PeerTask(constants, hold=1, seed=3)
     random = np.random.default_rng(5)
     aim = eqx.filter_jit(to_velocity)
     ends = set()
@@ -66,9 +53,9 @@ def test_peer_moves_sees_and_scores_as_we_do(peer_task, x64):
     assert ends == {"captured", "collided", "reached"}
 
 
-def test_peer_ends_at_the_time_limit(peer_task):
+def test_peer_ends_at_the_time_limit():
     constants = {**scenario_to_dict(load_scenario("paper", obstacle_count=0)), "episode_steps": 7}
-    task = peer_task(constants, hold=5)
+    task = PeerTask(constants, hold=5)
     task.place((0.0, 0.0), (50.0, 0.0, 0.0), None, (1.0, 1.0))
     assert task.act((0.0, 0.0))[2:] == (False, False)
     observation, reward, terminated, truncated = task.act((0.0, 0.0))

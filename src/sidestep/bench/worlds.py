@@ -1,0 +1,75 @@
+"""Many worlds of ours, stepped together: what simulation, scaling and the accelerator's section time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.learning.control_step import control_step
+from sidestep.pursuit import make_pursuer
+from sidestep.safety import make_shield
+from sidestep.world import Scenario, World, load_scenario, to_velocity
+
+AHEAD = (1.0, 0.0)
+"""The action of every side's policy: straight at the target."""
+
+
+def stepper(
+    scenario: Scenario, shield: str, pursuer: str, starts: World, periods: int
+) -> tuple[Callable[..., Any], Any]:
+    """`(advance(state) -> state, state)`: all worlds by `periods` control periods in one compiled call.
+
+    `starts` holds the worlds (leading axis). Each decides in every period, and starts again where it began as
+    soon as its episode has ended; so every period of every world is one that is lived through.
+    """
+    guard, chase = make_shield(shield, scenario), make_pursuer(pursuer)
+    memories = jax.jit(jax.vmap(guard.init))(starts)
+    keys = jax.random.split(jax.random.key(1), starts.evader.shape[0])
+
+    def period(start: World, memory_at_start: Any, world: World, memory: Any, key: Any) -> tuple[World, Any]:
+        nominal = to_velocity(scenario, world, jnp.asarray(AHEAD, world.evader.dtype))
+        moved, after, events, _, _ = control_step(scenario, guard, chase, world, memory, nominal, key)
+        ended = events.terminated | events.truncated
+        again = lambda fresh, old: jnp.where(ended, fresh, old)  # noqa: E731
+        return jax.tree.map(again, start, moved), jax.tree.map(again, memory_at_start, after)
+
+    @jax.jit
+    def advance(starts: World, memories: Any, state: tuple[World, Any]) -> tuple[World, Any]:
+        def body(state: tuple[World, Any], _: None) -> tuple[tuple[World, Any], None]:
+            return jax.vmap(period)(starts, memories, *state, keys), None
+
+        return jax.lax.scan(body, state, None, length=periods)[0]
+
+    return lambda state: jax.block_until_ready(advance(starts, memories, state)), (starts, memories)
+
+
+def drawn(scenario: Scenario, count: int, seed: int = 0) -> World:
+    """`count` worlds as episodes start."""
+    return jax.jit(jax.vmap(scenario.reset))(jax.random.split(jax.random.key(seed), count))
+
+
+def crowded(count: int, obstacles: int, pursuers: int, seed: int = 0) -> tuple[Scenario, World]:
+    """A scenario with that many of each, and worlds drawn evenly over a square that grows with their number.
+
+    Starts are not checked as episodes' are: how long the arithmetic takes does not depend on it.
+    """
+    scenario = load_scenario("paper", obstacle_count=obstacles, pursuer_count=pursuers)
+    half = 2.0 * np.sqrt(1.0 + obstacles + pursuers)
+    random = np.random.default_rng(seed)
+
+    def place(*shape: int) -> Any:
+        return random.uniform(-half, half, (count, *shape))
+
+    headings = random.uniform(-np.pi, np.pi, (count, pursuers, 1))
+    drift = np.broadcast_to([0.02, 0.0], (count, obstacles, 2))
+    worlds = jax.vmap(World)(
+        jnp.asarray(place(2), dtype=float),
+        jnp.asarray(np.concatenate([place(pursuers, 2), headings], axis=-1), dtype=float),
+        jnp.asarray(np.concatenate([place(obstacles, 2), drift], axis=-1), dtype=float),
+        jnp.asarray(place(2), dtype=float),
+    )
+    return scenario, worlds
