@@ -250,14 +250,20 @@ def _growth(
                 markersize=3, label=label,
             )  # fmt: skip
         axes.set_xscale("log", base=10 if kind in ("worlds", "episodes") else 2)
-        axes.set_yscale("log")
+        if exponents:
+            axes.set_yscale("log")
         sizes = sorted({point["size"] for case in curves for point in case["points"] if point["size"] > 0})
         if kind not in ("worlds", "episodes"):
             axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
-            axes.minorticks_off()
+        axes.minorticks_off()
         axes.set_ylabel(labels[kind])
         low, high = axes.get_ylim()
-        axes.set_ylim(low, high * (high / low) ** (0.14 * (1 + len(curves))))
+        # Room for the legend.
+        room = 0.14 * (1 + len(curves))
+        if exponents:
+            axes.set_ylim(low, high * (high / low) ** room)
+        else:
+            axes.set_ylim(0.0, high * (1.0 + room))
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper left", fontsize=6.5, borderaxespad=0.1, labelspacing=0.2)
         light_grid(axes)

@@ -18,33 +18,45 @@ AHEAD = (1.0, 0.0)
 """The action of every side's policy: straight at the target."""
 
 
+IN_LANES = False
+"""Step the worlds in lanes, with their axis behind all others, instead of under `jax.vmap`."""
+
+
 def stepper(
     scenario: Scenario, shield: str, pursuer: str, starts: World, periods: int
 ) -> tuple[Callable[..., Any], Any]:
     """`(advance(state) -> state, state)`: all worlds by `periods` control periods in one compiled call.
 
-    `starts` holds the worlds (leading axis). Each decides in every period, and starts again where it began as
-    soon as its episode has ended; so every period of every world is one that is lived through.
+    `starts` holds the worlds in front (leading axis), as `drawn` gives them. Each decides in every period,
+    and starts again where it began as soon as its episode has ended; so every period of every world is one that
+    is lived through.
     """
     guard, chase = make_shield(shield, scenario), make_pursuer(pursuer)
-    memories = jax.jit(jax.vmap(guard.init))(starts)
     keys = jax.random.split(jax.random.key(1), starts.evader.shape[0])
 
-    def period(start: World, memory_at_start: Any, world: World, memory: Any, key: Any) -> tuple[World, Any]:
-        nominal = to_velocity(scenario, world, jnp.asarray(AHEAD, world.evader.dtype))
+    def period(start: World, at_start: Any, world: World, memory: Any, key: Any) -> tuple[World, Any]:
+        ahead = jnp.asarray(AHEAD, world.evader.dtype)
+        ahead = jnp.broadcast_to(ahead.reshape(2, *[1] * (world.evader.ndim - 1)), world.evader.shape)
+        nominal = to_velocity(scenario, world, ahead)
         moved, after, events, _, _ = control_step(scenario, guard, chase, world, memory, nominal, key)
         ended = events.terminated | events.truncated
         again = lambda fresh, old: jnp.where(ended, fresh, old)  # noqa: E731
-        return jax.tree.map(again, start, moved), jax.tree.map(again, memory_at_start, after)
+        return jax.tree.map(again, start, moved), jax.tree.map(again, at_start, after)
+
+    if IN_LANES:
+        starts = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
+    everyone = period if IN_LANES else jax.vmap(period)
+    axis = -1 if IN_LANES else 0
+    memories = jax.jit(jax.vmap(guard.init, in_axes=axis, out_axes=axis))(starts)
 
     @jax.jit
-    def advance(starts: World, memories: Any, state: tuple[World, Any]) -> tuple[World, Any]:
+    def advance(starts: World, at_start: Any, state: tuple[World, Any], keys: Any) -> tuple[World, Any]:
         def body(state: tuple[World, Any], _: None) -> tuple[tuple[World, Any], None]:
-            return jax.vmap(period)(starts, memories, *state, keys), None
+            return everyone(starts, at_start, *state, keys), None
 
         return jax.lax.scan(body, state, None, length=periods)[0]
 
-    return lambda state: jax.block_until_ready(advance(starts, memories, state)), (starts, memories)
+    return lambda state: jax.block_until_ready(advance(starts, memories, state, keys)), (starts, memories)
 
 
 def drawn(scenario: Scenario, count: int, seed: int = 0) -> World:
