@@ -28,8 +28,8 @@ def stepper(
     """`(advance(state) -> state, state)`: all worlds by `periods` control periods in one compiled call.
 
     `starts` holds the worlds in front (leading axis), as `drawn` gives them. Each decides in every period,
-    and starts again where it began as soon as its episode has ended; so every period of every world is one that
-    is lived through.
+    and starts again where it began as soon as its episode has ended; so every period of every
+    world is one that is lived through.
     """
     guard, chase = make_shield(shield, scenario), make_pursuer(pursuer)
     keys = jax.random.split(jax.random.key(1), starts.evader.shape[0])
