@@ -1,13 +1,17 @@
 """Array types shared by every room."""
 
+import functools
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Bool, Float, Int
+
+_FEW = 8
 
 AnyArray: TypeAlias = Array | np.ndarray
 """What a public function accepts as an array: JAX or NumPy, traced or concrete."""
@@ -32,13 +36,37 @@ def stack(*components: object) -> Float[Array, "..."]:
     return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, components)))
 
 
-def lane_by_lane(
-    function: Callable[[Array], Array], argument: Float[Array, "n *lanes"]
-) -> Float[Array, "k *lanes"]:
-    """A function of one (n,) vector, for an argument that may have lanes behind its components."""
-    for _ in range(argument.ndim - 1):
+def lane_by_lane(function: Callable[..., Any], lanes: int, *arguments: Any) -> Any:
+    """A function of what has no lanes, for arguments (pytrees) that have `lanes` axes of them behind."""
+    for _ in range(lanes):
         function = jax.vmap(function, in_axes=-1, out_axes=-1)
-    return function(argument)
+    return function(*arguments)
+
+
+def fold(operation: Callable[[Any, Any], Any], parts: Array) -> Array:
+    """A ufunc such as `jnp.minimum` over the first axis, which must not be empty.
+
+    Few parts are taken one by one: unlike a reduction, XLA fuses that with what is around it.
+    """
+    if parts.shape[0] <= _FEW:
+        return functools.reduce(operation, [parts[i] for i in range(parts.shape[0])])
+    ufunc: Any = operation
+    return ufunc.reduce(parts, axis=0)
+
+
+def apart(function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function(*arguments)`, compiled apart from what is around it.
+
+    XLA would fuse it with whatever uses its results, and compute it anew for each use. On a CPU that also
+    makes loops so long that they are no longer vectorised.
+    """
+
+    def inside(*arguments: Any) -> Any:
+        with set_xla_metadata(inlineable=None):
+            return function(*arguments)
+
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(inside)(*arguments)
 
 
 def real(value: object) -> Float[Array, "..."]:

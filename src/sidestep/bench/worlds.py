@@ -18,7 +18,7 @@ AHEAD = (1.0, 0.0)
 """The action of every side's policy: straight at the target."""
 
 
-IN_LANES = False
+IN_LANES = True
 """Step the worlds in lanes, with their axis behind all others, instead of under `jax.vmap`."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -27,7 +27,12 @@ class Pursuer(eqx.Module):
 
     Subclasses define `steer`. Calling the strategy clips its answer to the wheel limits, so that no
     strategy can cheat, by rounding or otherwise; wheel speeds that are not finite become a stop.
+
+    One that computes with components and draws nothing, as most built-in ones, may set `takes_lanes`: it is
+    then asked for many worlds at once, with their axis behind all others; any other for each of them.
     """
+
+    takes_lanes: ClassVar[bool] = False
 
     @abc.abstractmethod
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
@@ -62,6 +67,8 @@ class Nash(Pursuer):
     Beside the usable part, where driving on would only pass the evader by, it turns again.
     """
 
+    takes_lanes = True
+
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(world.evader, world.pursuer)
@@ -69,7 +76,7 @@ class Nash(Pursuer):
         return jax.lax.cond(
             game.evader_can_escape,
             lambda: _approach(scenario, game, z),
-            lambda: lane_by_lane(lambda z: _hasten(game, z, scenario.control_period), z),
+            lambda: lane_by_lane(lambda z: _hasten(game, z, scenario.control_period), z.ndim - 1, z),
         )
 
 
@@ -100,13 +107,15 @@ def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2 *lanes"]
     reach = scenario.pursuer_speed * scenario.control_period
     strikes_from = game.largest_capture_distance - game.capture_distance + reach
     strike = (game.barrier(z)[0] <= strikes_from) & (jnp.abs(turn) <= game.usable_angle)
-    straight = stack(end, end) * game.pursuer_speed
-    return jnp.where(strike, straight, _toward(scenario, turn, end))
+    straight = end * game.pursuer_speed
+    return stack(*(jnp.where(strike, straight, wheel) for wheel in _toward(scenario, turn, end)))
 
 
 @final
 class TurnThenDrive(Pursuer):
     """Turns in place until it faces the evader, then drives straight at it, correcting as it goes."""
+
+    takes_lanes = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         return _toward(scenario, bearing_of(to_pursuer_frame(world.evader, world.pursuer)))
@@ -115,6 +124,8 @@ class TurnThenDrive(Pursuer):
 @final
 class TurnWhileDriving(Pursuer):
     """Never stops driving forward: turns toward the evader on arcs no tighter than about its inner wheel."""
+
+    takes_lanes = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         bearing = bearing_of(to_pursuer_frame(world.evader, world.pursuer))
@@ -128,6 +139,8 @@ class PurePursuit(Pursuer):
     The arc's curvature is 2 z_y/|z|^2, forward and backward alike (Coulter, "Implementation of the Pure
     Pursuit Path Tracking Algorithm", CMU-RI-TR-92-01, 1992).
     """
+
+    takes_lanes = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         z = to_pursuer_frame(world.evader, world.pursuer)
@@ -147,6 +160,8 @@ class Interceptor(Pursuer):
     The time to that point counts the turn in place, with the nearer end, and the straight drive after
     it; a few fixed-point steps find it. Against an evader too fast to be met it aims far ahead.
     """
+
+    takes_lanes = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         z = to_pursuer_frame(world.evader, world.pursuer)
@@ -177,6 +192,8 @@ class Random(Pursuer):
 class Still(Pursuer):
     """Never moves."""
 
+    takes_lanes = True
+
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         return jnp.zeros_like(world.pursuer[:2])
 
@@ -201,24 +218,34 @@ def make_pursuer(name: str) -> Pursuer:
 
 
 def pursue(
-    scenario: Scenario, pursuer: Callable[..., Any], world: World, key: PRNGKeyArray
+    scenario: Scenario, pursuer: Callable[..., Any], world: World, key: Any
 ) -> Float[Array, "m 2 *lanes"]:
     """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
 
     A strategy with a method `steer_all(scenario, world) -> (m, 2)` is asked for all of them at once instead.
+    Worlds in lanes need a key each, unless the strategy takes lanes: those draw nothing.
 
     **Raises** `ValueError` when the strategy's answer does not have shape (2,).
     """
     together = getattr(pursuer, "steer_all", None)
-    if together is not None:
-        return limit_wheels(together(scenario, world), scenario.pursuer_speed)
-    keys = jax.random.split(key, scenario.pursuer_count)
-    answers = []
-    for index in range(scenario.pursuer_count):
-        wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
-        if wheels.shape != world.evader.shape:
-            raise ValueError(
-                f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
+
+    def steer(world: World, key: Any) -> Float[Array, "m 2 *lanes"]:
+        if together is not None:
+            return jax.vmap(limit_wheels, in_axes=(0, None))(
+                together(scenario, world), scenario.pursuer_speed
             )
-        answers.append(real(wheels))
-    return jnp.stack(answers)
+        count = scenario.pursuer_count
+        keys = [key] * count if world.lanes else jax.random.split(key, count)
+        answers = []
+        for index in range(count):
+            wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
+            if wheels.shape != world.evader.shape:
+                raise ValueError(
+                    f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
+                )
+            answers.append(real(wheels))
+        return jnp.stack(answers)
+
+    if getattr(pursuer, "takes_lanes", False):
+        return steer(world, jnp.ravel(key)[0] if world.lanes and key.ndim else key)
+    return lane_by_lane(steer, world.lanes, world, key)

@@ -13,7 +13,15 @@ from sidestep.safety.catalogue import SHIELDS, as_shield, make_shield
 from sidestep.safety.certificate import Certificate, certify
 from sidestep.safety.filter import Projection, project, tolerance
 from sidestep.safety.joint import JointShield
-from sidestep.safety.shields import GameShield, NoShield, PaperShield, Shield, ShieldResult
+from sidestep.safety.shields import (
+    GameShield,
+    NoShield,
+    PaperShield,
+    Shield,
+    ShieldResult,
+    filter_in_lanes,
+    start_in_lanes,
+)
 from sidestep.safety.status import Status
 
 __all__ = [
@@ -36,7 +44,9 @@ __all__ = [
     "as_shield",
     "certify",
     "compose",
+    "filter_in_lanes",
     "make_shield",
     "project",
+    "start_in_lanes",
     "tolerance",
 ]

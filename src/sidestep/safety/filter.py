@@ -10,14 +10,14 @@ no branch and no matrix product (which a GPU would round to TF32): everything wo
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arrays import AnyArray, Lanes, Scalar
+from sidestep._arrays import AnyArray, Lanes, Scalar, fold, stack
 from sidestep.safety.least_violation import Rows, part, relax, root
 from sidestep.safety.status import Status
 
@@ -29,6 +29,10 @@ _UNLIKELY = 8.0
 _REJECTED = 16.0
 # What rounding leaves to break, the hard rows share as little.
 _HARDER = 16.0
+
+_Pair: TypeAlias = tuple[Lanes, Lanes]
+"""A velocity by its components. To be stacked last of all: XLA turns what is computed after it into a loop
+over components with a branch for each, which is ten times slower."""
 
 
 class Projection(eqx.Module):
@@ -89,11 +93,13 @@ def project(
     if not 0 <= hard <= count:
         raise ValueError(f"hard = {hard}: it must be between 0 and the number of rows, {count}")
 
-    nominal_valid = jnp.all(jnp.isfinite(nominal), axis=0)
+    nominal_valid = jnp.isfinite(nominal[0]) & jnp.isfinite(nominal[1])
     limit_valid = jnp.isfinite(limit) & (limit >= 0.0)
     row_valid = jnp.isfinite(normals[:, 0]) & jnp.isfinite(normals[:, 1]) & jnp.isfinite(offsets)
-    valid = nominal_valid & limit_valid & jnp.all(row_valid, axis=0)
-    nominal = jnp.where(nominal_valid, nominal, 0.0)
+    valid = nominal_valid & limit_valid
+    if count:
+        valid &= fold(jnp.logical_and, row_valid)
+    wanted = jnp.where(nominal_valid, nominal[0], 0.0), jnp.where(nominal_valid, nominal[1], 0.0)
     limit = jnp.where(limit_valid, limit, 0.0)
     x = jnp.where(row_valid, normals[:, 0], 0.0)
     y = jnp.where(row_valid, normals[:, 1], 0.0)
@@ -101,27 +107,30 @@ def project(
 
     moving = limit > 0.0
     unit = jnp.where(moving, limit, 1.0)
-    wish, start, weight, unchanged = _aim(nominal, unit, circle)
+    wish, start, weight, unchanged = _aim(wanted, unit, circle)
     rows, void = _normalise(x, y, c, unit)
-    never = jnp.any(void & (c > tolerance(dtype) * unit), axis=0)
+    never = fold(jnp.logical_or, void & (c > tolerance(dtype) * unit)) if count else False
 
     answer, given_way = _solve(wish, start, weight, rows, hard, circle)
 
     infeasible = (given_way > tolerance(dtype)) | (answer.violation > tolerance(dtype))
     # A robot that cannot move has one action: zero.
-    infeasible = never | jnp.where(moving, infeasible, jnp.any(c > 0.0, axis=0))
-    stopped = jnp.all(nominal == 0.0, axis=0)
+    unmoved = fold(jnp.logical_or, c > 0.0) if count else False
+    infeasible = never | jnp.where(moving, infeasible, unmoved)
+    stopped = (wanted[0] == 0.0) & (wanted[1] == 0.0)
     kept = ~infeasible & (
         jnp.where(moving, unchanged & (answer.x == start[0]) & (answer.y == start[1]), stopped)
     )
-    action = jnp.where(kept, nominal, jnp.stack([answer.x, answer.y]) * limit)
+    action = jnp.where(kept, wanted[0], answer.x * limit), jnp.where(kept, wanted[1], answer.y * limit)
     status = jnp.where(
         valid,
         jnp.where(infeasible, Status.INFEASIBLE, jnp.where(kept, Status.OK, Status.CORRECTED)),
         Status.INVALID,
     ).astype(jnp.int32)
+    if not count:
+        return Projection(stack(*action), status, jnp.full_like(answer.x, jnp.inf))
     slack = jnp.where(row_valid, x * action[0] + y * action[1] - c, jnp.inf)
-    return Projection(action, status, jnp.min(slack, axis=0, initial=jnp.inf))
+    return Projection(stack(*action), status, fold(jnp.minimum, slack))
 
 
 def project_known(
@@ -138,18 +147,18 @@ def project_known(
     **Arguments:** as for `project`, but everything finite, normals of unit length, |nominal| <= the limit,
     and that more than 0.
     """
-    wish, weight = nominal / speed_limit, jnp.zeros(nominal.shape[1:], nominal.dtype)
+    wish, weight = (nominal[0] / speed_limit, nominal[1] / speed_limit), jnp.zeros_like(nominal[0])
     start = wish
     if circle:
-        wish, start, weight, _ = _aim(nominal, speed_limit, circle)
+        wish, start, weight, _ = _aim((nominal[0], nominal[1]), speed_limit, circle)
     rows = Rows(normals[:, 0], normals[:, 1], offsets / speed_limit)
     answer, _ = _solve(wish, start, weight, rows, hard, circle)
-    return speed_limit * jnp.stack([answer.x, answer.y])
+    return stack(speed_limit * answer.x, speed_limit * answer.y)
 
 
 def _solve(
-    wish: Float[Array, "2 *lanes"],
-    start: Float[Array, "2 *lanes"],
+    wish: _Pair,
+    start: _Pair,
     weight: Lanes,
     rows: Rows,
     hard: int,
@@ -166,9 +175,7 @@ def _solve(
     return _closest(wish, start, weight, relaxed, hard, circle), given_way
 
 
-def _aim(
-    nominal: Float[Array, "2 *lanes"], unit: Scalar, circle: bool
-) -> tuple[Float[Array, "2 *lanes"], Float[Array, "2 *lanes"], Lanes, Bool[Array, "*lanes"]]:
+def _aim(nominal: _Pair, unit: Scalar, circle: bool) -> tuple[_Pair, _Pair, Lanes, Bool[Array, "*lanes"]]:
     """The nominal action in units of the limit (cut far out, where only its direction matters), its
     projection on the disc or circle, the weight of the distance measure, and whether it is there already.
 
@@ -176,23 +183,25 @@ def _aim(
     its projection on the disc and w = 1 - 1/|q|, |u - q|^2 is, up to a constant and a positive factor,
     |u - p|^2 + w (1 - |u|^2), which loses no digits.
     """
-    eps = float(jnp.finfo(nominal.dtype).eps)
+    dtype = nominal[0].dtype
+    eps = float(jnp.finfo(dtype).eps)
     size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(nominal[0]), jnp.abs(nominal[1])))
     some = size > 0.0
     safe = jnp.where(some, size, 1.0)
-    scaled = jnp.stack([jnp.where(some, nominal[0] / safe, 1.0), jnp.where(some, nominal[1] / safe, 0.0)])
-    norm = jnp.sqrt(scaled[0] ** 2 + scaled[1] ** 2)
-    direction = scaled / norm
+    x, y = jnp.where(some, nominal[0] / safe, 1.0), jnp.where(some, nominal[1] / safe, 0.0)
+    norm = jnp.sqrt(x**2 + y**2)
+    x, y = x / norm, y / norm
     speed = jnp.where(some, norm * safe, 0.0) / unit
-    near = jnp.where(speed <= 2.0, nominal / unit, direction * jnp.minimum(speed, 1.0 / eps))
-    slack = tolerance(nominal.dtype)
+    close, cut = speed <= 2.0, jnp.minimum(speed, 1.0 / eps)
+    near = jnp.where(close, nominal[0] / unit, x * cut), jnp.where(close, nominal[1] / unit, y * cut)
+    slack = tolerance(dtype)
     if circle:
         inside = jnp.abs(speed - 1.0) <= slack
         weight = jnp.zeros_like(speed)
     else:
         inside = speed <= 1.0 + slack
         weight = jnp.where(inside, 0.0, 1.0 - 1.0 / jnp.where(inside, 1.0, speed))
-    return near, jnp.where(inside, near, direction), weight, inside
+    return near, (jnp.where(inside, near[0], x), jnp.where(inside, near[1], y)), weight, inside
 
 
 def _normalise(
@@ -223,8 +232,8 @@ def _worst(measure: Callable[[Any, Any], Any], lines: Any, rows: Any) -> Any:
 
 
 def _closest(
-    wish: Float[Array, "2 *lanes"],
-    start: Float[Array, "2 *lanes"],
+    wish: _Pair,
+    start: _Pair,
     weight: Lanes,
     rows: Rows,
     hard: int,
@@ -286,15 +295,16 @@ def _closest(
     if 0 < hard < rows.c.shape[0]:
         rank = jnp.maximum(rank, _HARDER * jnp.maximum(_worst(miss, lines, part(rows, 0, hard)), outside))
     key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + rank)
+    c = jnp.clip(c, -1.0, 1.0)  # whatever rounding did, the speed limit holds
+    least, *best = _least(key, c * x - t * y, c * y + t * x, violation)
+    missed = fold(jnp.maximum, short_of_start)
+    stay = (missed <= tolerance(c.dtype)) | (_REJECTED + missed <= least)
+    answer = (jnp.where(stay, a, b) for a, b in zip((*start, missed), best, strict=True))
+    return _Answer(*answer)
+
+
+def _least(key: Float[Array, "k *lanes"], *entries: Float[Array, "k *lanes"]) -> tuple[Lanes, ...]:
+    """The smallest key, and the entries that go with it."""
     lowest = jnp.argmin(key, axis=0)
     chosen = lowest == jnp.arange(key.shape[0]).reshape(-1, *[1] * lowest.ndim)
-    pick = lambda entry: jnp.sum(jnp.where(chosen, entry, 0.0), axis=0)  # noqa: E731
-
-    c = jnp.clip(c, -1.0, 1.0)  # whatever rounding did, the speed limit holds
-    missed = jnp.max(short_of_start, axis=0)
-    stay = (missed <= tolerance(c.dtype)) | (_REJECTED + missed <= jnp.min(key, axis=0))
-    return _Answer(
-        jnp.where(stay, start[0], pick(c * x - t * y)),
-        jnp.where(stay, start[1], pick(c * y + t * x)),
-        jnp.where(stay, missed, pick(violation)),
-    )
+    return jnp.min(key, axis=0), *(jnp.sum(jnp.where(chosen, entry, 0.0), axis=0) for entry in entries)

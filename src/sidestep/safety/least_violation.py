@@ -61,7 +61,7 @@ def _within_reach(rows: Rows, first: int) -> Rows:
     c = jnp.where(live, rows.c, -2.0)
     top = jnp.max(c[first:], axis=0)
     moved = jnp.where(top > 2.0, (c[first:] - top) + 2.0, c[first:])
-    return Rows(rows.x, rows.y, jnp.maximum(jnp.concatenate([c[:first], moved]), -2.0))
+    return Rows(rows.x, rows.y, jnp.concatenate([jnp.maximum(c[:first], -2.0), jnp.maximum(moved, -2.0)]))
 
 
 def _disc_level(rows: Rows, first: int) -> Lanes:

@@ -1,13 +1,15 @@
 """Shields: from the action a policy would take to the action a robot may take, with a status."""
 
 import abc
+import functools
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arrays import AnyArray
+from sidestep._arrays import AnyArray, apart, lane_by_lane, stack
 from sidestep.safety.barriers import (
     Barrier,
     BarrierRows,
@@ -55,6 +57,11 @@ class Shield(eqx.Module):
         nominal one, without anything that is costly and has none. The shield itself if it is all rows."""
         return self
 
+    @property
+    def takes_lanes(self) -> bool:
+        """Whether it takes many worlds in lanes; others are asked for each (`filter_in_lanes`)."""
+        return False
+
     @abc.abstractmethod
     def init(self, world: World) -> Any:
         """The memory (a pytree) at the start of an episode."""
@@ -70,14 +77,37 @@ class Shield(eqx.Module):
         """
 
 
+def start_in_lanes(shield: Any, world: World) -> Any:
+    """`shield.init` for one world or for many in lanes, whatever the shield takes."""
+    if getattr(shield, "takes_lanes", False):
+        return shield.init(world)
+    return lane_by_lane(shield.init, world.lanes, world)
+
+
+def filter_in_lanes(
+    shield: Any, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+) -> tuple[Any, Any]:
+    """The shield's answer for one world or for each of many in lanes, whatever the shield takes."""
+    if not world.lanes:
+        return shield(world, nominal, memory)
+    if getattr(shield, "takes_lanes", False):
+        return apart(shield, world, nominal, memory)
+    return lane_by_lane(shield, world.lanes, world, nominal, memory)
+
+
 def _known(world: World) -> Bool[Array, "n *lanes"]:
     """Per pursuer and obstacle: whether it and the evader are where numbers say.
 
     Asked of the world itself, because a NaN can vanish on its way into a row: every comparison with it is
     false, and a `where` then takes the other case.
     """
-    robots = [jnp.all(jnp.isfinite(group), axis=1) for group in (world.pursuers, world.obstacles)]
-    return jnp.concatenate(robots) & jnp.all(jnp.isfinite(world.evader), axis=0)
+    evader = _finite(world.evader)
+    return jnp.concatenate([_finite(group, 1) & evader for group in (world.pursuers, world.obstacles)])
+
+
+def _finite(components: Float[AnyArray, "..."], axis: int = 0) -> Bool[Array, "..."]:
+    parts = (jax.lax.index_in_dim(components, i, axis, False) for i in range(components.shape[axis]))
+    return functools.reduce(jnp.logical_and, map(jnp.isfinite, parts))
 
 
 def _decide(
@@ -93,10 +123,11 @@ def _decide(
     nominal = jnp.asarray(nominal, rows.values.dtype)
     known = _known(world) if known is None else known
     known &= jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
-    known &= jnp.all(jnp.isfinite(rows.normals), axis=1)
-    wanted = jnp.where(jnp.all(jnp.isfinite(nominal), axis=0), nominal, 0.0)
+    known &= _finite(rows.normals, 1)
+    finite = _finite(nominal)
+    everything = functools.reduce(jnp.logical_and, known, jnp.ones_like(finite))
     # With part of the world unknown nothing vouches for the nominal action.
-    vouched = jnp.where(jnp.all(known, axis=0), nominal, 0.0)
+    vouched = stack(*(jnp.where(everything, component, 0.0) for component in nominal))
     count = rows.offsets.shape[0] if enforced else 0
     projection = project(
         vouched,
@@ -106,15 +137,16 @@ def _decide(
         hard=hard if enforced else 0,
         circle=scenario.action == "heading",
     )
-    status = jnp.where(jnp.all(known, axis=0), projection.status, Status.INVALID).astype(
-        projection.status.dtype
+    status = jnp.where(everything, projection.status, Status.INVALID).astype(projection.status.dtype)
+    turned, sped = (
+        new - jnp.where(finite, old, 0.0) for new, old in zip(projection.action, nominal, strict=True)
     )
     return ShieldResult(
         action=projection.action,
         status=status,
         barriers=jnp.where(known, rows.values, -jnp.inf),
         slack=projection.slack,
-        intervention=root(jnp.sum((projection.action - wanted) ** 2, axis=0)),
+        intervention=root(turned * turned + sped * sped),
     )
 
 
@@ -137,6 +169,10 @@ class NoShield(Shield):
 
     scenario: Scenario
 
+    @property
+    def takes_lanes(self) -> bool:
+        return True
+
     def init(self, world: World) -> Any:
         return RangeBarrier().remember(self.scenario, world)
 
@@ -156,6 +192,10 @@ class PaperShield(Shield):
     """
 
     scenario: Scenario
+
+    @property
+    def takes_lanes(self) -> bool:
+        return True
 
     def init(self, world: World) -> Any:
         return RangeBarrier().remember(self.scenario, world)
@@ -189,6 +229,10 @@ class GameShield(Shield):
     known_velocity: bool = eqx.field(static=True, default=False)
     wish_picks_side: bool = eqx.field(static=True, default=False)
 
+    @property
+    def takes_lanes(self) -> bool:
+        return not self.known_velocity
+
     def init(self, world: World) -> Any:
         return PursuitBarrier().remember(self.scenario, world)
 
@@ -199,7 +243,7 @@ class GameShield(Shield):
             return self._over_period(world, nominal, memory)
         m = self.scenario.pursuer_count
         rows, memory = self._kept_rows(world, nominal, memory)
-        values = rows.values.at[:m].add(sampling_margin(self.scenario)).at[m:].add(TOUCH)
+        values = jnp.concatenate([rows.values[:m] + sampling_margin(self.scenario), rows.values[m:] + TOUCH])
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
         return _decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
 

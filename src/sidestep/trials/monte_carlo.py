@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Count, Scalar, real
+from sidestep._arrays import Count
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.pursuit import as_pursuer
-from sidestep.safety import Shield, Status, as_shield
+from sidestep.safety import Shield, Status, as_shield, start_in_lanes
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.keys import as_key, episode_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
@@ -24,36 +24,38 @@ _CHUNK_STEPS = 200
 
 
 class Episode(eqx.Module):
-    """One episode on its way: where it is and what it has come to. `outcome` is -1 while it runs."""
+    """Episodes on their way, in lanes: where each is, what it has come to. `outcome` is -1 while it runs."""
 
-    number: Count
-    outcome: Count
+    number: Int[Array, "batch"]
+    outcome: Int[Array, "batch"]
     world: World
     memory: Any
-    steps: Count
-    total_reward: Scalar
-    pursuer_clearance: Scalar
-    obstacle_clearance: Scalar
-    interventions: Count
-    infeasible: Count
-    invalid: Count
-    correction: Scalar
-    max_correction: Scalar
+    steps: Int[Array, "batch"]
+    total_reward: Float[Array, "batch"]
+    pursuer_clearance: Float[Array, "batch"]
+    obstacle_clearance: Float[Array, "batch"]
+    interventions: Int[Array, "batch"]
+    infeasible: Int[Array, "batch"]
+    invalid: Int[Array, "batch"]
+    correction: Float[Array, "batch"]
+    max_correction: Float[Array, "batch"]
 
 
 @eqx.filter_jit
 def _starts(scenario: Scenario, key: PRNGKeyArray, numbers: Int[Array, "batch"]) -> World:
     """The worlds in which these episodes start."""
-    return jax.vmap(lambda number: scenario.reset(start_and_pursuit(episode_key(key, number))[0]))(numbers)
+    starts = jax.vmap(lambda number: scenario.reset(start_and_pursuit(episode_key(key, number))[0]))(numbers)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
 
 
-def _begin(shield: Any, number: Count, world: World) -> Episode:
-    none, zero, far = jnp.zeros((), jnp.int32), real(0.0), real(jnp.inf)
+def _begin(shield: Any, numbers: Int[Array, "batch"], worlds: World) -> Episode:
+    none, zero = jnp.zeros_like(numbers), jnp.zeros_like(worlds.time)
+    far = jnp.full_like(zero, jnp.inf)
     return Episode(
-        number=number,
-        outcome=jnp.full((), RUNNING, jnp.int32),
-        world=world,
-        memory=shield.init(world),
+        number=numbers,
+        outcome=jnp.full_like(numbers, RUNNING),
+        world=worlds,
+        memory=start_in_lanes(shield, worlds),
         steps=none,
         total_reward=zero,
         pursuer_clearance=far,
@@ -69,22 +71,18 @@ def _begin(shield: Any, number: Count, world: World) -> Episode:
 @eqx.filter_jit
 def _refill(shield: Any, slots: Episode, numbers: Int[Array, "batch"], worlds: World) -> Episode:
     """Slot i becomes episode `numbers[i]` at its start, unless that is negative."""
-    fresh = jax.vmap(lambda number, world: _begin(shield, number, world))(numbers, worlds)
-    return _select(numbers >= 0, fresh, slots)
+    return _select(numbers >= 0, _begin(shield, numbers, worlds), slots)
 
 
 def _empty_slots(shield: Any, worlds: World, size: int) -> Episode:
     """Slots in which nothing runs."""
     numbers = jnp.full(size, RUNNING, jnp.int32)
-    shapes = eqx.filter_eval_shape(jax.vmap(lambda n, w: _begin(shield, n, w)), numbers, worlds)
+    shapes = eqx.filter_eval_shape(_begin, shield, numbers, worlds)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def _select(flags: Array, if_true: Any, if_false: Any) -> Any:
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(flags.reshape(flags.shape + (1,) * (a.ndim - flags.ndim)), a, b)
-
-    return jax.tree.map(pick, if_true, if_false)
+    return jax.tree.map(lambda a, b: jnp.where(flags, a, b), if_true, if_false)
 
 
 @eqx.filter_jit
@@ -99,12 +97,14 @@ def _advance(
 ) -> Episode:
     """Every running episode by up to `decisions` decisions; stops early when none is running."""
 
+    def period_key(number: Array, steps: Array) -> PRNGKeyArray:
+        return jax.random.fold_in(start_and_pursuit(episode_key(key, number))[1], steps)
+
     def period(episode: Episode, nominal: Array) -> Episode:
-        _, pursuit_key = start_and_pursuit(episode_key(key, episode.number))
-        step_key = jax.random.fold_in(pursuit_key, episode.steps)
+        keys = jax.vmap(period_key)(episode.number, episode.steps)
         running = episode.outcome == RUNNING
         world, memory, events, result, _ = control_step(
-            scenario, shield, pursuer, episode.world.set_apart(~running), episode.memory, nominal, step_key
+            scenario, shield, pursuer, episode.world.set_apart(~running), episode.memory, nominal, keys
         )
         moved = Episode(
             number=episode.number,
@@ -132,7 +132,7 @@ def _advance(
         return (carry[0] < decisions) & jnp.any(carry[1].outcome == RUNNING)
 
     def advance(carry: tuple[Count, Episode]) -> tuple[Count, Episode]:
-        return carry[0] + 1, jax.vmap(decision)(carry[1])
+        return carry[0] + 1, decision(carry[1])
 
     return jax.lax.while_loop(more, advance, (jnp.zeros((), jnp.int32), episodes))[1]
 

@@ -15,10 +15,13 @@ Pursuers and obstacles come nearest first, so their order in the world does not 
 with an action in [-1, 1]^2 in the same axes; the velocity is v_e times the action, its norm cut to one.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, norm, real
+from sidestep._arrays import AnyArray, Lanes, Scalar, length, real, stack
 from sidestep.world.robots import limit_speed
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -45,66 +48,83 @@ def observation_names(scenario: Scenario) -> list[str]:
 
 
 def frame_axes(
-    scenario: Scenario, evader: Float[AnyArray, "2"], target: Float[AnyArray, "2"]
-) -> Float[Array, "2 2"]:
+    scenario: Scenario, evader: Float[AnyArray, "2 *lanes"], target: Float[AnyArray, "2 *lanes"]
+) -> Float[Array, "2 2 *lanes"]:
     """Rows are the unit axes of the policy's frame in world coordinates; the world's own at the target."""
-    dtype = real(0.0).dtype
     if scenario.frame == "world":
-        return jnp.eye(2, dtype=dtype)
-    offset = target - evader
-    squared = jnp.sum(offset**2)
+        one, none = jnp.ones_like(evader[0]), jnp.zeros_like(evader[0])
+        return stack(stack(one, none), stack(none, one))
+    x, y = target[0] - evader[0], target[1] - evader[1]
+    squared = x * x + y * y
     apart = squared > 0.0
-    ahead = jnp.where(
-        apart,
-        offset / jnp.sqrt(jnp.where(apart, squared, 1.0)),
-        jnp.array([1.0, 0.0], dtype),
-    )
-    return jnp.stack([ahead, jnp.stack([-ahead[1], ahead[0]])])
+    far = jnp.sqrt(jnp.where(apart, squared, 1.0))
+    x, y = jnp.where(apart, x / far, 1.0), jnp.where(apart, y / far, 0.0)
+    return stack(stack(x, y), stack(-y, x))
 
 
-def observe(scenario: Scenario, world: World) -> Float[Array, "observation"]:
-    """The observation of one world; see the table at the top of this module.
+def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lanes"]:
+    """The observation of one world, or of each of many in lanes; see the table at the top of this module.
 
-    **Returns** `(observation_size(scenario),)`. `jax.vmap` it over worlds.
+    **Returns** `(observation_size(scenario),)`. `jax.vmap` it over worlds with their axis in front.
     """
     axes = frame_axes(scenario, world.evader, world.target)
-    distance = norm(world.target - world.evader)
-    parts = [jnp.stack([jnp.tanh(distance / 2.0), jnp.exp(-distance / _NEAR_TARGET)])]
+    x, y = world.target[0] - world.evader[0], world.target[1] - world.evader[1]
+    distance = length(x, y)
+    entries = [jnp.tanh(distance / 2.0), jnp.exp(-distance / _NEAR_TARGET)]
     if scenario.frame == "world":
-        parts.append(
-            jnp.where(
-                distance > 0.0, (world.target - world.evader) / jnp.where(distance > 0.0, distance, 1.0), 0.0
-            )
-        )
+        far = jnp.where(distance > 0.0, distance, 1.0)
+        entries += [jnp.where(distance > 0.0, x / far, 0.0), jnp.where(distance > 0.0, y / far, 0.0)]
+
+    def along(x: Lanes, y: Lanes) -> tuple[Lanes, Lanes]:
+        return axes[0, 0] * x + axes[0, 1] * y, axes[1, 0] * x + axes[1, 1] * y
 
     def block(
-        places: Float[Array, "n 2"], extra: Float[Array, "n 2"], contact: Float[Array, ""]
-    ) -> Float[Array, "entries"]:
-        offsets = places - world.evader
-        distances = norm(offsets)
-        squashed = (offsets / (1.0 + distances[:, None])) @ axes.T
-        near = jnp.exp(-jnp.maximum(distances - contact, 0.0) / _NEAR_ROBOT)
-        entries = jnp.concatenate([squashed, extra @ axes.T, near[:, None]], axis=-1)
-        if len(places) > 1:
-            entries = entries[jnp.argsort(distances)]
-        return entries.reshape(-1)
+        robots: Float[AnyArray, "n d *lanes"], extra: Callable[[Any], tuple[Lanes, Lanes]], contact: Scalar
+    ) -> list[Lanes]:
+        """Entries of all robots of a kind, `extra` being the world vector that is told of each."""
+        distances = [length(robot[0] - world.evader[0], robot[1] - world.evader[1]) for robot in robots]
+        if len(distances) > 1:
+            order = jnp.argsort(jnp.stack(distances), axis=0)
+            robots = jnp.take_along_axis(robots, order[:, None], axis=0)
+            distances = jnp.take_along_axis(jnp.stack(distances), order, axis=0)
+        told = []
+        for robot, distance in zip(robots, distances, strict=True):
+            squash = 1.0 / (1.0 + distance)
+            told += along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash)
+            told += along(*extra(robot))
+            told.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / _NEAR_ROBOT))
+        return told
 
-    headings = jnp.stack([jnp.cos(world.pursuers[:, 2]), jnp.sin(world.pursuers[:, 2])], axis=-1)
-    parts.append(block(world.pursuers[:, :2], headings, scenario.capture_distance))
-    drift = world.obstacles[:, 2:] / scenario.evader_speed
-    parts.append(block(world.obstacles[:, :2], drift, scenario.collision_distance))
-    return jnp.concatenate(parts)
+    def heading(robot: Any) -> tuple[Lanes, Lanes]:
+        return jnp.cos(robot[2]), jnp.sin(robot[2])
+
+    def drift(robot: Any) -> tuple[Lanes, Lanes]:
+        return robot[2] / scenario.evader_speed, robot[3] / scenario.evader_speed
+
+    entries += block(world.pursuers, heading, scenario.capture_distance)
+    entries += block(world.obstacles, drift, scenario.collision_distance)
+    return stack(*entries)
 
 
-def to_velocity(scenario: Scenario, world: World, action: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+def to_velocity(
+    scenario: Scenario, world: World, action: Float[AnyArray, "2 *lanes"]
+) -> Float[Array, "2 *lanes"]:
     """The nominal velocity (m/s, world axes) that a policy's action in [-1, 1]^2 asks for."""
-    unit = limit_speed(action, real(1.0))
-    return scenario.evader_speed * (unit @ frame_axes(scenario, world.evader, world.target))
+    forward, aside = limit_speed(action, real(1.0))
+    ahead, left = frame_axes(scenario, world.evader, world.target)
+    speed = scenario.evader_speed
+    return stack(
+        speed * (forward * ahead[0] + aside * left[0]), speed * (forward * ahead[1] + aside * left[1])
+    )
 
 
-def to_action(scenario: Scenario, world: World, velocity: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+def to_action(
+    scenario: Scenario, world: World, velocity: Float[AnyArray, "2 *lanes"]
+) -> Float[Array, "2 *lanes"]:
     """The policy action that asks for `velocity` (m/s, world axes): the inverse of `to_velocity`."""
-    return frame_axes(scenario, world.evader, world.target) @ (velocity / scenario.evader_speed)
+    ahead, left = frame_axes(scenario, world.evader, world.target)
+    x, y = velocity[0] / scenario.evader_speed, velocity[1] / scenario.evader_speed
+    return stack(ahead[0] * x + ahead[1] * y, left[0] * x + left[1] * y)
 
 
 def goal_seeking(observation: Float[AnyArray, "observation"]) -> Float[Array, "2"]:

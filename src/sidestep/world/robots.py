@@ -1,35 +1,43 @@
 """How robots move: exact motion over one zero-order hold, and the closest approach within it."""
 
-import jax
+from itertools import pairwise
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Lanes, Scalar, norm, real
+from sidestep._arrays import AnyArray, Lanes, length, stack
 
 _CHORDS = 4
 _NEWTON_STEPS = 2
 
 
-def limit_speed(velocity: Float[AnyArray, "2"], speed_limit: Float[AnyArray, ""]) -> Float[Array, "2"]:
+def limit_speed(
+    velocity: Float[AnyArray, "2 *lanes"], speed_limit: Float[AnyArray, ""]
+) -> Float[Array, "2 *lanes"]:
     """Project a velocity (m/s) on the disc |u| <= `speed_limit`; a non-finite velocity becomes a stop.
 
     The physics never lets a command exceed what the robot can do, and never lets a NaN into the
     state, where every later comparison with it would silently be false.
     """
+    finite = jnp.isfinite(velocity[0]) & jnp.isfinite(velocity[1])
     # Clipped far above any speed, or else the square of a huge command overflows.
-    velocity = jnp.clip(jnp.where(jnp.all(jnp.isfinite(velocity)), velocity, 0.0), -1e15, 1e15)
-    squared = jnp.sum(velocity**2)
-    too_fast = squared > speed_limit**2
-    length = jnp.sqrt(jnp.where(too_fast, squared, 1.0))
-    return jnp.where(too_fast, velocity * (speed_limit / length), velocity)
+    x, y = (jnp.clip(jnp.where(finite, component, 0.0), -1e15, 1e15) for component in velocity)
+    squared = x * x + y * y
+    # At the limit rounding decides which side a speed is on, and XLA may compute it anew for each component:
+    # either answer must give the same, and so what is divided by must be the speed on both sides.
+    fast = squared > 0.25 * speed_limit**2
+    speed = jnp.sqrt(jnp.where(fast, squared, 1.0))
+    scale = jnp.where(squared > speed_limit**2, speed_limit / speed, 1.0)
+    return stack(x * scale, y * scale)
 
 
 def limit_wheels(
-    wheel_speeds: Float[AnyArray, "*shape"], rim_speed: Float[AnyArray, ""]
-) -> Float[Array, "*shape"]:
+    wheel_speeds: Float[AnyArray, "2 *lanes"], rim_speed: Float[AnyArray, ""]
+) -> Float[Array, "2 *lanes"]:
     """Clip wheel rim speeds (m/s) to [-V, V], which is |v| + b|omega| <= V; non-finite ones become 0."""
-    finite = jnp.where(jnp.isfinite(wheel_speeds), wheel_speeds, 0.0)
-    return jnp.clip(finite, -rim_speed, rim_speed)
+    finite = (jnp.where(jnp.isfinite(speed), speed, 0.0) for speed in wheel_speeds)
+    return stack(*(jnp.clip(speed, -rim_speed, rim_speed) for speed in finite))
 
 
 def wrap_angle(angle: Float[AnyArray, "..."]) -> Float[Array, "..."]:
@@ -54,7 +62,7 @@ def wheels_from_body(
     speed: Float[AnyArray, "*lanes"], turn_rate: Float[AnyArray, "*lanes"], half_axle: Float[AnyArray, ""]
 ) -> Float[Array, "2 *lanes"]:
     """Wheel rim speeds (left, right) in m/s that give speed v and turn rate omega."""
-    return jnp.stack([speed - half_axle * turn_rate, speed + half_axle * turn_rate])
+    return stack(speed - half_axle * turn_rate, speed + half_axle * turn_rate)
 
 
 def drive(
@@ -90,30 +98,31 @@ def glide(
     duration: Float[AnyArray, ""],
 ) -> Float[Array, "2 *lanes"]:
     """Omnidirectional robot or drifting obstacle: straight motion at constant velocity."""
-    return jnp.asarray(position) + velocity * duration
+    return stack(position[0] + velocity[0] * duration, position[1] + velocity[1] * duration)
 
 
 def closest_approach_straight(
-    relative_position: Float[AnyArray, "2"],
-    relative_velocity: Float[AnyArray, "2"],
+    relative_position: Float[AnyArray, "2 *lanes"],
+    relative_velocity: Float[AnyArray, "2 *lanes"],
     duration: Float[AnyArray, ""],
-) -> Scalar:
+) -> Lanes:
     """Smallest distance (m) between two robots in straight motion during a hold (closed form)."""
-    squared_speed = jnp.sum(relative_velocity**2)
+    (x, y), (vx, vy) = relative_position, relative_velocity
+    squared_speed = vx * vx + vy * vy
     still = squared_speed == 0.0
-    when = -jnp.sum(relative_position * relative_velocity) / jnp.where(still, 1.0, squared_speed)
+    when = -(x * vx + y * vy) / jnp.where(still, 1.0, squared_speed)
     when = jnp.clip(jnp.where(still, 0.0, when), 0.0, duration)
-    return norm(relative_position + relative_velocity * when)
+    return length(x + vx * when, y + vy * when)
 
 
 def closest_approach_driving(
-    position: Float[AnyArray, "2"],
-    velocity: Float[AnyArray, "2"],
-    pose: Float[AnyArray, "3"],
-    wheel_speeds: Float[AnyArray, "2"],
+    position: Float[AnyArray, "2 *lanes"],
+    velocity: Float[AnyArray, "2 *lanes"],
+    pose: Float[AnyArray, "3 *lanes"],
+    wheel_speeds: Float[AnyArray, "2 *lanes"],
     half_axle: Float[AnyArray, ""],
     duration: Float[AnyArray, ""],
-) -> Scalar:
+) -> Lanes:
     """Smallest distance (m) between a robot in straight motion and a differential drive during a hold.
 
     A straight line and an arc have no closed form. Four chords bracket the minimum, Newton's method on
@@ -121,31 +130,50 @@ def closest_approach_driving(
     below the true minimum and above it by second order in a time error that is itself tiny.
     """
     speed, turn_rate = body_velocity(wheel_speeds, half_axle)
-    start = jnp.asarray(position) - pose[:2]
+    x, y = position[0] - pose[0], position[1] - pose[1]
+    vx, vy = velocity[0], velocity[1]
+    ahead, left = jnp.cos(pose[2]), jnp.sin(pose[2])
 
-    def separation(when: Scalar) -> Float[Array, "2"]:
+    def arc(when: Any) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+        """Where the pursuer is on its arc, and cos and sin of its heading."""
+        # Half the turn away from the first heading points the chord, the other half the heading; adding
+        # angles by their cosines and sines, all need one pair of them.
         half_turn = turn_rate * when / 2.0
-        chord = speed * when * jnp.sinc(half_turn / jnp.pi)
-        along = pose[2] + half_turn
-        return start + velocity * when - chord * jnp.stack([jnp.cos(along), jnp.sin(along)])
+        cosine, sine = jnp.cos(half_turn), jnp.sin(half_turn)
+        turning = half_turn != 0.0
+        chord = speed * when * jnp.where(turning, sine / jnp.where(turning, half_turn, 1.0), 1.0)
+        mx, my = ahead * cosine - left * sine, left * cosine + ahead * sine
+        return chord * mx, chord * my, mx * cosine - my * sine, my * cosine + mx * sine
 
+    def separation(when: Any) -> tuple[Lanes, Lanes]:
+        px, py, _, _ = arc(when)
+        return x + vx * when - px, y + vy * when - py
+
+    # Equal chords, each turned by the same angle against the one before it.
     step = duration / _CHORDS
-    knots = real(jnp.arange(_CHORDS + 1)) * step
-    path = jax.vmap(separation)(knots)
-    first, chord = path[:-1], path[1:] - path[:-1]
-    squared = jnp.sum(chord**2, axis=-1)
-    fraction = jnp.clip(-jnp.sum(first * chord, axis=-1) / jnp.where(squared == 0.0, 1.0, squared), 0.0, 1.0)
-    distances = jnp.sum((first + fraction[:, None] * chord) ** 2, axis=-1)
-    nearest = jnp.argmin(distances)
-    low = knots[nearest]
-    when = low + fraction[nearest] * step
+    px, py, cosine, sine = arc(step)
+    cosine, sine = cosine * ahead + sine * left, sine * ahead - cosine * left
+    knots = [(x, y)]
+    for _ in range(_CHORDS):
+        knots.append((knots[-1][0] + vx * step - px, knots[-1][1] + vy * step - py))
+        px, py = px * cosine - py * sine, py * cosine + px * sine
+
+    best, low, when = jnp.inf, 0.0, 0.0
+    for i, ((x0, y0), (x1, y1)) in enumerate(pairwise(knots)):
+        cx, cy = x1 - x0, y1 - y0
+        squared = cx * cx + cy * cy
+        share = jnp.clip(-(x0 * cx + y0 * cy) / jnp.where(squared == 0.0, 1.0, squared), 0.0, 1.0)
+        distance = (x0 + share * cx) ** 2 + (y0 + share * cy) ** 2
+        nearer = distance < best
+        best = jnp.where(nearer, distance, best)
+        low = jnp.where(nearer, step * i, low)
+        when = jnp.where(nearer, step * (i + share), when)
     for _ in range(_NEWTON_STEPS):
-        heading = pose[2] + turn_rate * when
-        forward = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-        left = jnp.stack([-forward[1], forward[0]])
-        q, rate, bend = separation(when), velocity - speed * forward, -speed * turn_rate * left
-        slope = jnp.sum(rate**2) + jnp.sum(q * bend)
-        update = when - jnp.sum(q * rate) / jnp.where(slope > 0.0, slope, 1.0)
+        px, py, cosine, sine = arc(when)
+        qx, qy = x + vx * when - px, y + vy * when - py
+        rx, ry = vx - speed * cosine, vy - speed * sine
+        slope = rx * rx + ry * ry + speed * turn_rate * (qx * sine - qy * cosine)
+        update = when - (qx * rx + qy * ry) / jnp.where(slope > 0.0, slope, 1.0)
         when = jnp.where(slope > 0.0, jnp.clip(update, low, low + step), when)
-    ends = jnp.minimum(norm(path[0]), norm(path[-1]))
-    return jnp.minimum(norm(separation(when)), ends)
+    ends = jnp.minimum(length(x, y), length(*knots[-1]))
+    return jnp.minimum(length(*separation(when)), ends)

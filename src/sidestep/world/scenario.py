@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Scalar, norm, real
+from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, length, norm, real, stack
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
 from sidestep.world.robots import (
@@ -157,10 +159,10 @@ class Scenario(eqx.Module):
     def step(
         self,
         world: World,
-        action: Float[AnyArray, "2"],
-        wheel_speeds: Float[AnyArray, "m 2"] | Float[AnyArray, "2"],
+        action: Float[AnyArray, "2 *lanes"],
+        wheel_speeds: Float[AnyArray, "m 2 *lanes"] | Float[AnyArray, "2 *lanes"],
     ) -> tuple[World, Events]:
-        """One control period of pure physics: no shield, no policy.
+        """One control period of pure physics: no shield, no policy; of one world, or of many in lanes.
 
         **Arguments:** `action` the evader's velocity (m/s, world axes), projected on what the robot can
         do (disc or circle); `wheel_speeds` left and right rim speed (m/s) of each pursuer, clipped to
@@ -172,21 +174,24 @@ class Scenario(eqx.Module):
         """
         period = self.control_period
         velocity = self.executable(action)
-        wheels = limit_wheels(jnp.reshape(wheel_speeds, (self.pursuer_count, 2)), self.pursuer_speed)
+        shape = (self.pursuer_count, *velocity.shape)
+        wheels = jax.vmap(limit_wheels, in_axes=(0, None))(
+            jnp.reshape(wheel_speeds, shape), self.pursuer_speed
+        )
 
-        def approach(pose: Array, wheel: Array) -> Scalar:
+        def approach(pose: Array, wheel: Array) -> Lanes:
             return closest_approach_driving(
                 world.evader, velocity, pose, wheel, self.pursuer_half_axle, period
             )
 
-        def pass_by(obstacle: Array) -> Scalar:
+        def pass_by(obstacle: Array) -> Lanes:
             return closest_approach_straight(world.evader - obstacle[:2], velocity - obstacle[2:], period)
 
         to_pursuers = jax.vmap(approach)(world.pursuers, wheels)
         to_obstacles = jax.vmap(pass_by)(world.obstacles)
         to_target = closest_approach_straight(world.evader - world.target, velocity, period)
-        pursuer_clearance = jnp.min(to_pursuers, initial=jnp.inf) - self.capture_distance
-        obstacle_clearance = jnp.min(to_obstacles, initial=jnp.inf) - self.collision_distance
+        pursuer_clearance = _nearest(to_pursuers) - self.capture_distance
+        obstacle_clearance = _nearest(to_obstacles) - self.collision_distance
 
         moved = self.moved(world, velocity, wheels)
         # As counted there, in whole periods.
@@ -195,7 +200,7 @@ class Scenario(eqx.Module):
         collided = obstacle_clearance <= 0.0
         reached = (to_target <= self.reach_distance) & ~captured & ~collided
         timed_out = (periods >= self.episode_steps) & ~captured & ~collided & ~reached
-        distance = norm(moved.evader - moved.target)
+        distance = length(moved.evader[0] - moved.target[0], moved.evader[1] - moved.target[1])
         return moved, Events(
             reward=jnp.where(reached, self.reach_reward, -self.distance_cost * distance),
             captured=captured,
@@ -231,7 +236,7 @@ class Scenario(eqx.Module):
             ),
         )
 
-    def executable(self, velocity: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+    def executable(self, velocity: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
         """The velocity (m/s) the evader drives when told `velocity`: on the disc, or on the circle.
 
         In `heading` mode a robot told to stop keeps its circle speed along world x, since the speed is
@@ -241,9 +246,14 @@ class Scenario(eqx.Module):
         if self.action == "velocity":
             return limited
         # Scaled before it is squared, or else a tiny command underflows and loses its direction.
-        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(limited)))
+        largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(limited[0]), jnp.abs(limited[1])))
         moving = largest > 0.0
-        scaled = jnp.where(
-            moving, limited / jnp.where(moving, largest, 1.0), jnp.array([1.0, 0.0], limited.dtype)
-        )
-        return self.evader_speed * (scaled / norm(scaled))
+        safe = jnp.where(moving, largest, 1.0)
+        x, y = jnp.where(moving, limited[0] / safe, 1.0), jnp.where(moving, limited[1] / safe, 0.0)
+        scale = self.evader_speed / length(x, y)
+        return stack(x * scale, y * scale)
+
+
+def _nearest(distances: Float[Array, "n *lanes"]) -> Lanes:
+    """The smallest of the distances (m), infinite where there are none."""
+    return functools.reduce(jnp.minimum, distances, jnp.full(distances.shape[1:], jnp.inf, distances.dtype))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from sidestep._arrays import AnyArray, Flag, Scalar, real
+from sidestep._arrays import AnyArray, Scalar, real
 
 
 class World(eqx.Module):
@@ -52,6 +52,11 @@ class World(eqx.Module):
         )
 
     @property
+    def lanes(self) -> int:
+        """How many batch axes the world has behind its components; none unless it holds many worlds."""
+        return self.evader.ndim - 1
+
+    @property
     def pursuer(self) -> Float[AnyArray, "3 *lanes"]:
         """The pursuer being steered or asked about: x, y, heading."""
         return self.pursuers[0]
@@ -66,7 +71,7 @@ class World(eqx.Module):
             (jnp.roll(self.pursuers, -index, axis=0), jnp.roll(self.wheel_speeds, -index, axis=0)),
         )
 
-    def set_apart(self, when: Flag) -> World:
+    def set_apart(self, when: Bool[Array, "*lanes"]) -> World:
         """The same world, but with pursuers and obstacles a kilometre further off where `when`.
 
         For an episode that has ended and is only stepped on because others of its batch have not: out there
