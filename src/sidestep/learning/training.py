@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -272,26 +270,7 @@ def decide_and_learn(
     return state, report
 
 
-@functools.cache
-def _compiler_options() -> dict[str, str]:
-    """What the compiler is told for a loop of updates; nothing where it has no such option."""
-    if jax.default_backend() != "cpu":
-        return {}
-    # Products of the size of TD3's layers: a step with 256 x 256 and batch 256 took 2.8 ms instead of 3.1.
-    options = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"}
-    try:
-        jax.jit(lambda x: x @ x, compiler_options=options)(jnp.ones((8, 8)))
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return options
-
-
-@functools.cache
-def _compiled() -> Any:
-    options: dict[str, Any] = {"compiler_options": _compiler_options()}
-    return eqx.filter_jit(_run_chunk, donate="none", **options)
-
-
+@eqx.filter_jit(donate="none")
 def run_chunk(
     scenario: Scenario,
     shield: Any,
@@ -302,21 +281,7 @@ def run_chunk(
     length: int,
 ) -> tuple[TrainState, Report]:
     """`length` decisions in one compiled loop; the report has a leading axis of `length`."""
-    everything = (scenario, shield, pursuer, options, state, limit)
-    # Compiler options belong to the outermost function that is compiled.
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(everything))
-    return (_run_chunk if traced else _compiled())(*everything, length)
 
-
-def _run_chunk(
-    scenario: Scenario,
-    shield: Any,
-    pursuer: Any,
-    options: TrainingOptions,
-    state: TrainState,
-    limit: Count,
-    length: int,
-) -> tuple[TrainState, Report]:
     def body(state: TrainState, _: None) -> tuple[TrainState, Report]:
         return decide_and_learn(scenario, shield, pursuer, options, state, limit)
 
