@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,15 +44,17 @@ def lane_by_lane(function: Callable[..., Any], lanes: int, *arguments: Any) -> A
     return function(*arguments)
 
 
-def fold(operation: Callable[[Any, Any], Any], parts: Array) -> Array:
-    """A ufunc such as `jnp.minimum` over the first axis, which must not be empty.
+def fold(operation: Callable[[Any, Any], Any], parts: Array, initial: float | bool) -> Array:
+    """A ufunc such as `jnp.minimum` over the first axis; `initial`, its neutral element, if that is empty.
 
     Few parts are taken one by one: unlike a reduction, XLA fuses that with what is around it.
     """
-    if parts.shape[0] <= _FEW:
-        return functools.reduce(operation, [parts[i] for i in range(parts.shape[0])])
-    ufunc: Any = operation
-    return ufunc.reduce(parts, axis=0)
+    if parts.shape[0] > _FEW:
+        ufunc: Any = operation
+        return ufunc.reduce(parts, axis=0)
+    if parts.shape[0] == 0:
+        return jnp.full(parts.shape[1:], initial, parts.dtype)
+    return functools.reduce(operation, parts)
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -61,12 +64,15 @@ def apart(function: Callable[..., Any], *arguments: Any) -> Any:
     makes loops so long that they are no longer vectorised.
     """
 
-    def inside(*arguments: Any) -> Any:
-        with set_xla_metadata(inlineable=None):
-            return function(*arguments)
-
     with set_xla_metadata(inlineable="false"):
-        return jax.jit(inside)(*arguments)
+        return _inside(function, *arguments)
+
+
+@eqx.filter_jit
+def _inside(function: Callable[..., Any], *arguments: Any) -> Any:
+    # What is inside may be inlined there.
+    with set_xla_metadata(inlineable=None):
+        return function(*arguments)
 
 
 def real(value: object) -> Float[Array, "..."]:

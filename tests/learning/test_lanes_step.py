@@ -52,6 +52,18 @@ def test_worlds_in_lanes_do_what_each_does_alone(shield, name):
         assert np.mean(agree) >= 0.9
 
 
+def test_what_is_compiled_apart_is_compiled_once():
+    traced = []
+
+    def function(x):
+        traced.append(x)
+        return 2.0 * x
+
+    for _ in range(3):
+        apart(function, jnp.ones(5))
+    assert len(traced) == 1
+
+
 def test_compiling_apart_changes_nothing_but_the_program():
     def function(x, pair):
         return {"sum": x + pair[0] * jnp.where(x > 0.0, pair[1], 0.0)}

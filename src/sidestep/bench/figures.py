@@ -12,6 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from sidestep.views.style import (
     BLUE,
+    FAINT,
     GREEN,
     GREY,
     INK,
@@ -135,7 +136,7 @@ def _joint(axes: Axes, section: dict[str, Any]) -> None:
     for place, case in enumerate(cases):
         timed = case["latency"]
         low, middle, high = (timed[key] / 1000.0 for key in ("p50", "p99", "worst"))
-        axes.plot([low, high], [place, place], color="#C8C8C8", linewidth=2.0, zorder=1)
+        axes.plot([low, high], [place, place], color=FAINT, linewidth=2.0, zorder=1)
         marks = ((low, "o", "median"), (middle, "s", "99 of 100"), (high, "X", "worst"))
         for value, marker, word in marks:
             axes.scatter(

@@ -16,7 +16,7 @@ import numpy as np
 
 from sidestep.bench.children import Case
 from sidestep.bench.machine import cores
-from sidestep.bench.timing import spread
+from sidestep.bench.timing import durations, first_call, spread
 
 BATCH, HIDDEN, WARMUP, BUFFER = 256, [256, 256], 256, 10_000
 PURSUER = "turn-then-drive"
@@ -48,16 +48,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         first, seconds = _stable_baselines(side, chunk, budget)
     else:
         advance = _rejax(chunk) if side == "rejax" else _ours(side.partition("-")[2], chunk)
-        begun = time.perf_counter()
-        advance()
-        first = time.perf_counter() - begun
-        for _ in range(-(-WARMUP // chunk)):
-            advance()
-        seconds, end = [], time.perf_counter() + budget
-        while time.perf_counter() < end or len(seconds) < 3:
-            begun = time.perf_counter()
-            advance()
-            seconds.append(time.perf_counter() - begun)
+        _, first = first_call(advance)
+        seconds = durations(lambda _: advance(), budget, least=3, warm_up=-(-WARMUP // chunk))
     per_step = [spent / chunk for spent in seconds]
     return {
         "latency": spread(per_step, "ms"),

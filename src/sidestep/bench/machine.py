@@ -103,10 +103,20 @@ def peak_memory_mib() -> float:
                 return int(line.split()[1]) / 1024.0
     except OSError:
         pass
+    return _most_memory_mib(of_children=False)
+
+
+def peak_memory_of_children_mib() -> float:
+    """The most memory that any child process which has ended had held, MiB."""
+    return _most_memory_mib(of_children=True)
+
+
+def _most_memory_mib(*, of_children: bool) -> float:
     import resource
 
     scale = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
+    who = resource.RUSAGE_CHILDREN if of_children else resource.RUSAGE_SELF
+    return resource.getrusage(who).ru_maxrss / scale
 
 
 def forget_peak_memory() -> None:

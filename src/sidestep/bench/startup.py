@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sidestep.bench.children import Case
+from sidestep.bench.machine import peak_memory_of_children_mib
 from sidestep.bench.timing import spread
 
 CLI = ["-m", "sidestep.cli"]
@@ -53,7 +54,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         _seconds(COMMANDS[name], {})
         return {
             "latency": spread([_seconds(COMMANDS[name], {}) for _ in range(settings["repeats"])], "ms"),
-            "peak_memory_mib": _memory_of_children(),
+            "peak_memory_mib": peak_memory_of_children_mib(),
         }
     with tempfile.TemporaryDirectory() as folder:
         caches = {"XDG_CACHE_HOME": str(Path(folder) / "cache")}
@@ -61,7 +62,11 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         for time_ in ("cold", "warm"):
             command = [part.replace("RUN", str(Path(folder) / time_)) for part in FIRST_RESULTS[name]]
             seconds.append(_seconds(command, caches))
-    return {"cold_seconds": seconds[0], "warm_seconds": seconds[1], "peak_memory_mib": _memory_of_children()}
+    return {
+        "cold_seconds": seconds[0],
+        "warm_seconds": seconds[1],
+        "peak_memory_mib": peak_memory_of_children_mib(),
+    }
 
 
 def _seconds(arguments: list[str], environment: dict[str, str]) -> float:
@@ -77,13 +82,6 @@ def _seconds(arguments: list[str], environment: dict[str, str]) -> float:
     if done.returncode:
         raise RuntimeError(f"{' '.join(arguments)} failed: {done.stderr.strip()[-500:]}")
     return spent
-
-
-def _memory_of_children() -> float:
-    import resource
-
-    scale = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / scale
 
 
 def summary(results: list[dict[str, Any]]) -> dict[str, Any]:

@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sidestep.learning.control_step import control_step
 from sidestep.pursuit import make_pursuer
-from sidestep.safety import make_shield
+from sidestep.safety import make_shield, start_in_lanes
 from sidestep.world import Scenario, World, load_scenario, to_velocity
 
 AHEAD = (1.0, 0.0)
 """The action of every side's policy: straight at the target."""
-
-
-IN_LANES = True
-"""Step the worlds in lanes, with their axis behind all others, instead of under `jax.vmap`."""
 
 
 def stepper(
@@ -35,24 +32,20 @@ def stepper(
     keys = jax.random.split(jax.random.key(1), starts.evader.shape[0])
 
     def period(start: World, at_start: Any, world: World, memory: Any, key: Any) -> tuple[World, Any]:
-        ahead = jnp.asarray(AHEAD, world.evader.dtype)
-        ahead = jnp.broadcast_to(ahead.reshape(2, *[1] * (world.evader.ndim - 1)), world.evader.shape)
+        ahead = jnp.broadcast_to(jnp.asarray(AHEAD, world.evader.dtype)[:, None], world.evader.shape)
         nominal = to_velocity(scenario, world, ahead)
         moved, after, events, _, _ = control_step(scenario, guard, chase, world, memory, nominal, key)
         ended = events.terminated | events.truncated
         again = lambda fresh, old: jnp.where(ended, fresh, old)  # noqa: E731
         return jax.tree.map(again, start, moved), jax.tree.map(again, at_start, after)
 
-    if IN_LANES:
-        starts = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
-    everyone = period if IN_LANES else jax.vmap(period)
-    axis = -1 if IN_LANES else 0
-    memories = jax.jit(jax.vmap(guard.init, in_axes=axis, out_axes=axis))(starts)
+    starts = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
+    memories = eqx.filter_jit(start_in_lanes)(guard, starts)
 
     @jax.jit
     def advance(starts: World, at_start: Any, state: tuple[World, Any], keys: Any) -> tuple[World, Any]:
         def body(state: tuple[World, Any], _: None) -> tuple[tuple[World, Any], None]:
-            return everyone(starts, at_start, *state, keys), None
+            return period(starts, at_start, *state, keys), None
 
         return jax.lax.scan(body, state, None, length=periods)[0]
 

@@ -96,9 +96,7 @@ def project(
     nominal_valid = jnp.isfinite(nominal[0]) & jnp.isfinite(nominal[1])
     limit_valid = jnp.isfinite(limit) & (limit >= 0.0)
     row_valid = jnp.isfinite(normals[:, 0]) & jnp.isfinite(normals[:, 1]) & jnp.isfinite(offsets)
-    valid = nominal_valid & limit_valid
-    if count:
-        valid &= fold(jnp.logical_and, row_valid)
+    valid = nominal_valid & limit_valid & fold(jnp.logical_and, row_valid, True)
     wanted = jnp.where(nominal_valid, nominal[0], 0.0), jnp.where(nominal_valid, nominal[1], 0.0)
     limit = jnp.where(limit_valid, limit, 0.0)
     x = jnp.where(row_valid, normals[:, 0], 0.0)
@@ -109,14 +107,13 @@ def project(
     unit = jnp.where(moving, limit, 1.0)
     wish, start, weight, unchanged = _aim(wanted, unit, circle)
     rows, void = _normalise(x, y, c, unit)
-    never = fold(jnp.logical_or, void & (c > tolerance(dtype) * unit)) if count else False
+    never = fold(jnp.logical_or, void & (c > tolerance(dtype) * unit), False)
 
     answer, given_way = _solve(wish, start, weight, rows, hard, circle)
 
     infeasible = (given_way > tolerance(dtype)) | (answer.violation > tolerance(dtype))
     # A robot that cannot move has one action: zero.
-    unmoved = fold(jnp.logical_or, c > 0.0) if count else False
-    infeasible = never | jnp.where(moving, infeasible, unmoved)
+    infeasible = never | jnp.where(moving, infeasible, fold(jnp.logical_or, c > 0.0, False))
     stopped = (wanted[0] == 0.0) & (wanted[1] == 0.0)
     kept = ~infeasible & (
         jnp.where(moving, unchanged & (answer.x == start[0]) & (answer.y == start[1]), stopped)
@@ -127,10 +124,8 @@ def project(
         jnp.where(infeasible, Status.INFEASIBLE, jnp.where(kept, Status.OK, Status.CORRECTED)),
         Status.INVALID,
     ).astype(jnp.int32)
-    if not count:
-        return Projection(stack(*action), status, jnp.full_like(answer.x, jnp.inf))
     slack = jnp.where(row_valid, x * action[0] + y * action[1] - c, jnp.inf)
-    return Projection(stack(*action), status, fold(jnp.minimum, slack))
+    return Projection(stack(*action), status, fold(jnp.minimum, slack, jnp.inf))
 
 
 def project_known(
@@ -297,7 +292,7 @@ def _closest(
     key = jnp.where(violation <= tolerance(c.dtype), key, _REJECTED + rank)
     c = jnp.clip(c, -1.0, 1.0)  # whatever rounding did, the speed limit holds
     least, *best = _least(key, c * x - t * y, c * y + t * x, violation)
-    missed = fold(jnp.maximum, short_of_start)
+    missed = fold(jnp.maximum, short_of_start, -jnp.inf)
     stay = (missed <= tolerance(c.dtype)) | (_REJECTED + missed <= least)
     answer = (jnp.where(stay, a, b) for a, b in zip((*start, missed), best, strict=True))
     return _Answer(*answer)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arrays import AnyArray, apart, lane_by_lane, stack
+from sidestep._arrays import AnyArray, apart, fold, lane_by_lane, stack
 from sidestep.safety.barriers import (
     Barrier,
     BarrierRows,
@@ -125,7 +125,7 @@ def _decide(
     known &= jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
     known &= _finite(rows.normals, 1)
     finite = _finite(nominal)
-    everything = functools.reduce(jnp.logical_and, known, jnp.ones_like(finite))
+    everything = fold(jnp.logical_and, known, True)
     # With part of the world unknown nothing vouches for the nominal action.
     vouched = stack(*(jnp.where(everything, component, 0.0) for component in nominal))
     count = rows.offsets.shape[0] if enforced else 0

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, length, norm, real, stack
+from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, fold, length, norm, real, stack
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
 from sidestep.world.robots import (
@@ -190,8 +188,8 @@ class Scenario(eqx.Module):
         to_pursuers = jax.vmap(approach)(world.pursuers, wheels)
         to_obstacles = jax.vmap(pass_by)(world.obstacles)
         to_target = closest_approach_straight(world.evader - world.target, velocity, period)
-        pursuer_clearance = _nearest(to_pursuers) - self.capture_distance
-        obstacle_clearance = _nearest(to_obstacles) - self.collision_distance
+        pursuer_clearance = fold(jnp.minimum, to_pursuers, jnp.inf) - self.capture_distance
+        obstacle_clearance = fold(jnp.minimum, to_obstacles, jnp.inf) - self.collision_distance
 
         moved = self.moved(world, velocity, wheels)
         # As counted there, in whole periods.
@@ -252,8 +250,3 @@ class Scenario(eqx.Module):
         x, y = jnp.where(moving, limited[0] / safe, 1.0), jnp.where(moving, limited[1] / safe, 0.0)
         scale = self.evader_speed / length(x, y)
         return stack(x * scale, y * scale)
-
-
-def _nearest(distances: Float[Array, "n *lanes"]) -> Lanes:
-    """The smallest of the distances (m), infinite where there are none."""
-    return functools.reduce(jnp.minimum, distances, jnp.full(distances.shape[1:], jnp.inf, distances.dtype))
