@@ -63,7 +63,7 @@ def test_errors_and_delay_are_budgeted_and_leave_a_certified_start():
     np.testing.assert_allclose(budget["position"], 3e-3)
     np.testing.assert_allclose(budget["heading"], 0.2 * 0.787 * 0.01)
     np.testing.assert_allclose(budget["delay"], 0.1574 * 0.03, rtol=1e-6)
-    parts = [budget[name] for name in ("position", "heading", "delay", "sampling", "sides")]
+    parts = [budget[name] for name in ("position", "heading", "delay", "sampling", "tracking", "sides")]
     np.testing.assert_allclose(budget["total"], sum(parts))
     np.testing.assert_allclose(budget["required"], 0.17 + budget["total"])
     assert budget["required"] <= found.largest_capture_distance

@@ -74,6 +74,7 @@ GAMES = {
     "20 Hz": SampledGame(**PAPER, control_period=0.05),
     "2 Hz": SampledGame(**PAPER, control_period=0.5),
     "errors": SampledGame(**PAPER, control_period=0.05, position_error=4e-3, heading_error=0.02),
+    "motors": SampledGame(**PAPER, control_period=0.05, tracking_error=5e-3),
     "short axle": SampledGame(0.18, 0.22, 0.08, 0.1),
 }
 every_game = pytest.mark.parametrize("game", GAMES.values(), ids=GAMES.keys())

@@ -37,6 +37,8 @@ class Certify:
     """Age of the measurements, s."""
     own_motion: bool = True
     """Whether the evader adds its own motion during the delay to what it measured."""
+    tracking_error: float = 0.0
+    """How far the velocity that the evader drives may be from the one that it was told, m/s."""
     walls: bool = False
     """The robots are in a bounded arena."""
     start: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
@@ -78,6 +80,7 @@ def run(command: Certify, console: Console) -> int:
             heading_error=command.heading_error,
             delay=command.delay,
             own_motion_predicted=command.own_motion,
+            tracking_error=command.tracking_error,
             walls=command.walls,
             start=start,
             target_distance=command.target_distance,
@@ -158,6 +161,7 @@ def _budget_table(certificate: Certificate) -> Any:
         "heading": "heading error, b rho per rad",
         "delay": "delay, v_e per s",
         "sampling": "sampling, delta(T)",
+        "tracking": "velocity driven, not told",
         "sides": "telling the sides of the pursuer's axis apart",
     }
     table = Table("added to the capture distance", "mm", title="Budget")

@@ -9,6 +9,7 @@ from sidestep.safety.barriers import (
     RangeBarrier,
     compose,
 )
+from sidestep.safety.budget import Budget, BudgetWarning
 from sidestep.safety.catalogue import SHIELDS, as_shield, make_shield
 from sidestep.safety.certificate import Certificate, certify
 from sidestep.safety.filter import Projection, project, tolerance
@@ -29,6 +30,8 @@ __all__ = [
     "SHIELDS",
     "Barrier",
     "BarrierRows",
+    "Budget",
+    "BudgetWarning",
     "Certificate",
     "GameShield",
     "JointShield",

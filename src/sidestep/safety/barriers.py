@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sidestep._arrays import AnyArray, Lanes, Scalar, real, stack
+from sidestep._arrays import AnyArray, Lanes, Scalar, length, real, stack
 from sidestep.pursuit.game import CaptureGame, turning_moment
+from sidestep.safety.budget import Budget
 from sidestep.world.capture_geometry import to_pursuer_frame
 from sidestep.world.robots import body_velocity, drive
 from sidestep.world.scenario import Scenario
@@ -227,6 +228,8 @@ class PursuitBarrier(Barrier):
     which for h = 0 is m cos S with m = b rho - l tan S. It is left at half of that, for the evader's own
     side, whose h is larger: with 2 |y| sin S = h_own - h, the change never lowers the value.
 
+    With a `budget` a side is kept, too, for as long as its errors may have the evader on it.
+
     With `eased` (m) the row asks for no way back from as far below 0: alpha is 0 there. That is for a barrier
     that keeps more than it must, and may be met by an evader in between.
 
@@ -235,6 +238,7 @@ class PursuitBarrier(Barrier):
 
     known_velocity: bool = eqx.field(static=True, default=False)
     eased: Scalar | float = 0.0
+    budget: Budget | None = None
 
     def robots(self, world: World) -> Float[Array, "n d *lanes"]:
         if self.known_velocity:
@@ -364,6 +368,9 @@ class PursuitBarrier(Barrier):
     ) -> Bool[Array, "*lanes"]:
         cosine, sine = jnp.cos(game.usable_angle), jnp.sin(game.usable_angle)
         ahead, across = jnp.abs(z[0]), jnp.maximum(-side * z[1], 0.0)
+        if self.budget is not None:
+            doubt = self.budget.position_error + self.budget.heading_error * length(z[0], z[1])
+            across = jnp.maximum(across - doubt, 0.0)
         in_front = jnp.abs(z[1]) * cosine < ahead * sine
 
         def reach(h: Lanes) -> Lanes:

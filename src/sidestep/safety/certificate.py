@@ -3,11 +3,12 @@
 For one pursuer in the unbounded plane that may react at any instant, and an evader that decides once per
 control period from measurements with bounded errors and age. The budget is
 
-    l' = l + position + b rho heading + delay + sampling + sides  <=  l_max,
+    l' = l + position + b rho heading + delay + sampling + tracking + sides  <=  l_max,
 
 where `position` and `heading` are what the errors can hide of the barrier (it changes by at most 1 per metre
 and b rho per rad), `delay` is what the pursuer can gain unseen (v_e tau), `sampling` is delta(T) of
-`sampled_design`, and `sides` is what the same computation needs beyond these parts because an evader that
+`sampled_design`, `tracking` what more it needs where the motors do not drive quite what they are told, and
+`sides` is what the same computation needs beyond these parts because an evader that
 measures with errors cannot always tell on which side of the pursuer's axis it is.
 """
 
@@ -98,6 +99,7 @@ def certify(
     heading_error: float = 0.0,
     delay: float = 0.0,
     own_motion_predicted: bool = True,
+    tracking_error: float = 0.0,
     walls: bool = False,
     start: tuple[float, float] | None = None,
     target_distance: float | None = None,
@@ -109,8 +111,9 @@ def certify(
     """What can be guaranteed for a scenario's robots.
 
     **Arguments:** `position_error` (m) and `heading_error` (rad) bound every measurement of the pursuer,
-    `delay` (s) is its age; `own_motion_predicted`: the evader adds its own motion since. `walls`: the robots
-    are in a bounded arena. `start`: evader in the pursuer's frame (m). `target_distance` (m): asked of where
+    `delay` (s) is its age; `own_motion_predicted`: the evader adds its own motion since.
+    `tracking_error` (m/s) bounds how far the velocity driven is from the one told. `walls`: the robots are in
+    a bounded arena. `start`: evader in the pursuer's frame (m). `target_distance` (m): asked of where
     the pursuer wins. `half_axle` and `control_period`: instead of the scenario's; they may be 0 here.
     `check_shield`: also compute what the shipped `game` shield keeps. `progress` is told what is computed.
 
@@ -119,6 +122,7 @@ def certify(
     tell = progress or (lambda _: None)
     numbers = {
         "position_error": position_error, "heading_error": heading_error, "delay": delay,
+        "tracking_error": tracking_error,
         "target_distance": target_distance, "half_axle": half_axle, "control_period": control_period,
     }  # fmt: skip
     for name, value in numbers.items():
@@ -135,6 +139,7 @@ def certify(
         heading_error=float(heading_error),
         delay=float(delay),
         own_motion_predicted=own_motion_predicted,
+        tracking_error=float(tracking_error),
     )
     situation = replace(situation, game=game)
     tell("what can be held at this period")
@@ -156,14 +161,17 @@ def certify(
 def _answer(situation: Situation, tell: Callable[[str], None]) -> Certificate:
     game, wanted = situation.game, situation.capture_distance
     limit = game.largest_capture_distance
-    exact = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
+    tracked = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
+    exact = replace(tracked, tracking_error=0.0)
     held = best_design(game)
     sampled = held if exact == game else best_design(exact)
+    driven = sampled if exact == tracked else best_design(tracked)
+    levels = [0.0 if design is None else design.level for design in (sampled, driven)]
     clearance = 0.0 if held is None else max(held.level - delay_cost(game), 0.0)
     needed = wanted + delay_cost(game)
     if outruns(game, needed):
         clearance = math.inf
-    budget = _budget(game, wanted, clearance, 0.0 if sampled is None else sampled.level)
+    budget = _budget(game, wanted, clearance, *levels)
     # The parts of the plain budget bound the clearance too, where they happen to be the stricter ones.
     if math.isfinite(clearance) and math.isfinite(limit):
         clearance = max(min(clearance, limit - budget["total"]), 0.0)
@@ -194,7 +202,9 @@ def _answer(situation: Situation, tell: Callable[[str], None]) -> Certificate:
     )
 
 
-def _budget(game: SampledGame, wanted: float, clearance: float, sampled: float) -> dict[str, float]:
+def _budget(
+    game: SampledGame, wanted: float, clearance: float, sampled: float, driven: float
+) -> dict[str, float]:
     limit = game.largest_capture_distance
     ratio = min(game.evader_speed / game.pursuer_speed, 1.0)
     parts = {
@@ -202,6 +212,7 @@ def _budget(game: SampledGame, wanted: float, clearance: float, sampled: float) 
         "heading": game.half_axle * ratio * game.heading_error,
         "delay": delay_cost(game),
         "sampling": limit - sampled if math.isfinite(limit) else 0.0,
+        "tracking": sampled - driven if math.isfinite(limit) else 0.0,
     }
     used = sum(parts.values())
     spent = limit - clearance if math.isfinite(limit) and math.isfinite(clearance) else used

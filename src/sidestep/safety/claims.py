@@ -57,9 +57,12 @@ def _assumptions(certificate: Certificate) -> str:
     )
     age = f", {game.delay:g} s old" if game.delay > 0.0 else ""
     own = "" if game.delay == 0.0 or game.own_motion_predicted else " and its own motion since not added"
+    drives = (
+        "" if game.tracking_error == 0.0 else f", driving up to {game.tracking_error:g} m/s off its commands"
+    )
     return (
-        f"deciding every {game.control_period:g} s on {measured}{age}{own}, against one pursuer that may do "
-        "anything its wheels allow, at any instant"
+        f"deciding every {game.control_period:g} s on {measured}{age}{own}{drives}, against one "
+        "pursuer that may do anything its wheels allow, at any instant"
     )
 
 
@@ -146,7 +149,7 @@ def _shield(certificate: Certificate) -> list[Claim]:
     if certificate.shield is None:
         return []
     game, level = certificate.situation.game, certificate.shield
-    exact = game.position_error == game.heading_error == game.delay == 0.0
+    exact = game.position_error == game.heading_error == game.delay == game.tracking_error == 0.0
     text = (
         f"The `game` shield as shipped, set to this capture distance, keeps {level.level:.4g} m whatever the "
         f"policy wants, from one pursuer{'' if exact else ' and, unlike the rest, with exact measurements'}. "

@@ -99,6 +99,7 @@ def chase(
         measured = seen_from(z, np.stack([zeros, zeros, turn], -1)) + error
         velocity, side = flee(game, design, measured, side)
         velocity = seen_from(velocity, np.stack([zeros, zeros, -turn], -1))
+        velocity = velocity - game.tracking_error * velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
         wheels, share = random_wheels(rng, motions, segments, game.pursuer_speed)
         poses = wheel_motions(wheels, game.period * share, game.half_axle)
         after = seen_from((z + velocity * game.period)[:, None], poses[None])

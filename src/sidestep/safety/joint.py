@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import AnyArray, Flag, Scalar, norm, real
 from sidestep.pursuit import Pursuer, make_pursuer, pursue
+from sidestep.safety.budget import Budget
 from sidestep.safety.by_need import by_need
 from sidestep.safety.look_ahead import STRETCHES, WISHES, Outlook, clearance, imagine, stretch, wish
 from sidestep.safety.shields import GameShield, Shield, ShieldResult
@@ -91,7 +92,8 @@ class JointShield(Shield):
     a larger one leaves more room to move, and to change sides close to a pursuer's axis. A chase is imagined
     `horizon` (s) ahead in `steps` periods, or in as many of the robot's own where those are longer. Periods
     longer than the robot's promise too much, because an evader gains on a pursuer that decides less often;
-    `steps` is what a decision costs. The decision carries no derivatives; the action does.
+    `steps` is what a decision costs. With a `budget` the rows keep it (see `GameShield`), and clear means so
+    much more. The decision carries no derivatives; the action does.
     """
 
     scenario: Scenario
@@ -100,13 +102,14 @@ class JointShield(Shield):
     near_pursuer: Scalar = eqx.field(converter=real, default=0.5)
     margin: Scalar = eqx.field(converter=real, default=0.02)
     horizon: Scalar = eqx.field(converter=real, default=8.0)
+    budget: Budget | None = None
     steps: int = eqx.field(static=True, default=160)
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 
     @property
     def _game(self) -> GameShield:
         scenario = eqx.tree_at(lambda s: s.pursuer_gain, self.scenario, self.pursuer_gain)
-        return GameShield(scenario, wish_picks_side=True)
+        return GameShield(scenario, self.budget, wish_picks_side=True)
 
     @property
     def rows_only(self) -> GameShield:
@@ -216,9 +219,11 @@ class JointShield(Shield):
         return jnp.where(memory.counts, least >= self._floor(now), least > 0.0)
 
     def _floor(self, world: World) -> Scalar:
-        """The clearance (m) that a way out must keep: the margin, or what there is now if that is less."""
+        """The clearance (m) that a way out must keep: the margin and the budget, or what there is now if that
+        is less."""
         now = clearance(self.scenario, world)
-        return jnp.clip(now - _GIVE, 0.0, self.margin)
+        more = 0.0 if self.budget is None else self.budget.towards_obstacles(self.scenario)
+        return jnp.clip(now - _GIVE, 0.0, self.margin + more)
 
     def _search(self, situation: _Situation) -> _Decision:
         memory = situation.memory

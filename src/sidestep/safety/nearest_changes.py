@@ -22,6 +22,7 @@ PARAMETERS: dict[str, str] = {
     "position_error": "m",
     "heading_error": "rad",
     "delay": "s",
+    "tracking_error": "m/s",
 }
 """What may be changed to make a guarantee hold, and its unit."""
 
@@ -68,6 +69,7 @@ def nearest_changes(situation: Situation, clearance: float) -> tuple[Change, ...
         change("position_error", game.position_error, search("position_error", 0.0)),
         change("heading_error", game.heading_error, search("heading_error", 0.0)),
         change("delay", game.delay, search("delay", 0.0) if _spare(undelayed, wanted) >= 0.0 else None),
+        change("tracking_error", game.tracking_error, search("tracking_error", 0.0)),
     )
 
 

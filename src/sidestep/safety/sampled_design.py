@@ -47,7 +47,9 @@ def outruns(game: SampledGame, level: float) -> bool:
     Then no distance beyond it ever falls, whatever the period: |z + u t| grows by v_e t cos(error) at least.
     """
     error = game.heading_error + bearing_error(game, level)
-    return error < math.pi / 2.0 and game.evader_speed * math.cos(error) >= game.pursuer_speed
+    return error < math.pi / 2.0 and (
+        game.evader_speed * math.cos(error) - game.tracking_error >= game.pursuer_speed
+    )
 
 
 def best_angle(game: SampledGame, level: float, cells: Cells, sections: int = 9) -> tuple[float, float]:

@@ -52,6 +52,7 @@ class SampledGame:
 
     `position_error` and `heading_error` bound what each measurement is off by (m, rad), `delay` is how old
     it is (s). `own_motion_predicted`: whether the evader adds its own motion during the delay.
+    `tracking_error` bounds how far (m/s) the velocity driven is from the one that the law asks for.
     """
 
     evader_speed: float
@@ -62,6 +63,7 @@ class SampledGame:
     heading_error: float = 0.0
     delay: float = 0.0
     own_motion_predicted: bool = True
+    tracking_error: float = 0.0
 
     @property
     def usable_angle(self) -> float:
@@ -88,7 +90,13 @@ class SampledGame:
         A delay leaves the *pursuer's* pose old, and the game between the evader now and the pursuer then is
         the same game; only an evader that does not add its own motion takes it for an error of position.
         """
-        return self.position_error + (0.0 if self.own_motion_predicted else self.evader_speed * self.delay)
+        unseen = self.tracking_error if self.own_motion_predicted else self.evader_speed + self.tracking_error
+        return self.position_error + unseen * self.delay
+
+    @property
+    def drift(self) -> float:
+        """How far from where the law meant it to be the evader may end a period, m: g_s falls by no more."""
+        return self.tracking_error * self.period
 
 
 @dataclass(frozen=True)
@@ -304,14 +312,15 @@ def slack(game: SampledGame, design: Design, cells: Cells) -> float:
     if not math.isfinite(overlap(game, design.angle)[0]) or error >= math.pi / 2.0:
         return -math.inf
     bounds = (_straight_bound(game, design, cells, error), _arc_bound(game, design, cells, error))
-    return min(float(np.min(bound)) for bound in bounds) - design.level
+    return min(float(np.min(bound)) for bound in bounds) - game.drift - design.level
 
 
 def found_slack(game: SampledGame, design: Design, turns: int = 401) -> float:
     """The least of g_s(z(T)) - c found among real motions, m: an upper bound, where `slack` is a lower one.
 
     From points all along the straight part, for the extreme directions that the errors lead the law to, the
-    pursuer first turning on the spot for any of `turns` shares of the period, then driving, either way.
+    pursuer first turning on the spot for any of `turns` shares of the period, then driving, either way. The
+    evader's own drift is along the normal that counts.
     """
     angle, level = design.angle, design.level
     constant, growth = overlap(game, angle)
@@ -331,4 +340,4 @@ def found_slack(game: SampledGame, design: Design, turns: int = 401) -> float:
         here, there = side_value(after, angle, 1.0), side_value(after, angle, -1.0)
         value = np.where(after[..., 1] >= -past, here, there)
         worst = min(worst, float(np.min(value)))
-    return worst - level
+    return worst - game.drift - level

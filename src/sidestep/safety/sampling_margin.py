@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from sidestep._arrays import Scalar
 from sidestep.pursuit.game import CaptureGame
+from sidestep.safety.budget import Budget
 from sidestep.world.scenario import Scenario
 
 TOUCH = 1e-5
@@ -28,14 +29,23 @@ def sampling_margin(scenario: Scenario) -> Scalar:
     return jnp.minimum(gained, 0.5 * spare)
 
 
-def guarded(scenario: Scenario) -> Scenario:
-    """The scenario with the distances that the rows keep: `sampling_margin` towards pursuers, and `TOUCH`
-    towards obstacles."""
+def margins(scenario: Scenario, budget: Budget | None = None) -> tuple[Scalar, Scalar]:
+    """Distances (m) that the rows keep beyond those of capture and collision: `sampling_margin` and `TOUCH`,
+    and the budget's."""
+    pursuers, obstacles = sampling_margin(scenario), jnp.asarray(TOUCH, scenario.collision_distance.dtype)
+    if budget is None:
+        return pursuers, obstacles
+    return pursuers + budget.towards_pursuers(scenario), obstacles + budget.towards_obstacles(scenario)
+
+
+def guarded(scenario: Scenario, budget: Budget | None = None) -> Scenario:
+    """The scenario with the distances that the rows keep, see `margins`, and the evader's speed that the
+    capture set is built for, see `Budget.sure_speed`."""
+    pursuers, obstacles = margins(scenario, budget)
+    kept = scenario.capture_distance + pursuers
+    speed = scenario.evader_speed if budget is None else budget.sure_speed(scenario, kept)
     return eqx.tree_at(
-        lambda s: (s.capture_distance, s.collision_distance),
+        lambda s: (s.capture_distance, s.collision_distance, s.evader_speed),
         scenario,
-        (
-            scenario.capture_distance + sampling_margin(scenario),
-            scenario.collision_distance + TOUCH,
-        ),
+        (kept, scenario.collision_distance + obstacles, speed),
     )

@@ -18,9 +18,10 @@ from sidestep.safety.barriers import (
     RangeBarrier,
     compose,
 )
+from sidestep.safety.budget import Budget
 from sidestep.safety.filter import project, project_known
 from sidestep.safety.least_violation import root
-from sidestep.safety.sampling_margin import TOUCH, guarded, sampling_margin
+from sidestep.safety.sampling_margin import guarded, margins, sampling_margin
 from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -223,11 +224,20 @@ class GameShield(Shield):
 
     `wish_picks_side=True` lets the nominal action choose the side of a pursuer's axis where either will do,
     see `PursuitBarrier.prefer`.
+
+    With a `budget` the rows also keep what measurement, delay and motors may take, see `Budget`. One that is
+    more than the game leaves is kept as well as can be, as everything that cannot: the further out the rows
+    begin to ask for retreat, the closer the distance stays to the best that is possible.
     """
 
     scenario: Scenario
+    budget: Budget | None = None
     known_velocity: bool = eqx.field(static=True, default=False)
     wish_picks_side: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self) -> None:
+        if self.known_velocity and self.budget is not None:
+            raise ValueError("the rows for a known velocity keep no budget; leave out one of the two")
 
     @property
     def takes_lanes(self) -> bool:
@@ -243,20 +253,30 @@ class GameShield(Shield):
             return self._over_period(world, nominal, memory)
         m = self.scenario.pursuer_count
         rows, memory = self._kept_rows(world, nominal, memory)
-        values = jnp.concatenate([rows.values[:m] + sampling_margin(self.scenario), rows.values[m:] + TOUCH])
+        towards_pursuers, towards_obstacles = margins(self.scenario, self.budget)
+        values = jnp.concatenate([rows.values[:m] + towards_pursuers, rows.values[m:] + towards_obstacles])
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
         return _decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
 
     def _kept_rows(self, world: World, wish: Any, memory: Any) -> tuple[BarrierRows, Any]:
         """The rows at the distances that are kept, and the sides of the pursuers' axes that they follow."""
-        kept = guarded(self.scenario)
         # Where the margin has been used up the row still holds what is left, and asks for no more.
-        barrier = PursuitBarrier(eased=sampling_margin(self.scenario))
+        barrier = PursuitBarrier(eased=sampling_margin(self.scenario), budget=self.budget)
+        kept = guarded(self.scenario)
+        # The side is kept for as long as the distances themselves leave a choice: in the budget's margin
+        # there seems to be none, and errors would have the evader change sides all the time.
         if self.wish_picks_side:
             memory = barrier.prefer(kept, world, memory, wish)
         else:
             memory = barrier.remember(kept, world, memory)
-        return _with_obstacles(barrier, kept, world, memory), memory
+        if self.budget is not None:
+            barrier = PursuitBarrier(eased=margins(self.scenario, self.budget)[0])
+            kept = guarded(self.scenario, self.budget)
+        rows = _with_obstacles(barrier, kept, world, memory)
+        if self.budget is None:
+            return rows, memory
+        offsets = rows.offsets + self.budget.tracking_error
+        return eqx.tree_at(lambda rows: rows.offsets, rows, offsets), memory
 
     def heed(
         self, world: World, wish: Float[Array, "2 *lanes"], memory: Float[Array, "m *lanes"]

@@ -34,6 +34,7 @@ _PARTS = (
     ("heading", "+ heading error", ORANGE),
     ("delay", "+ delay", PURPLE),
     ("sampling", "+ sampling", SKY),
+    ("tracking", "+ tracking error", GREEN),
     ("sides", "+ telling sides apart", GREY),
 )
 
