@@ -1,0 +1,218 @@
+"""Where are the robots now, and how do they move, as told by poses that err and come late?
+
+One Kalman filter per robot, in the world's axes. Each holds its estimate at the stamp of the last pose that
+it took; what is between that stamp and now is the caller's to ask for. In NumPy, because the filters are tiny
+and are fed one pose at a time.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections import deque
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+
+_HISTORY = 5.0
+"""Commands are remembered for so long (s)."""
+_REACTION = 0.1
+"""Within about this time (s) a pursuer's wheels go from rest to full speed, as far as its filter knows."""
+
+
+def turned(angle: float) -> float:
+    """An angle (rad) wrapped to [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+class Track(abc.ABC):
+    """What is known of one robot: nothing until the first pose, see `stamp`."""
+
+    stamp: float | None = None
+    """When the last pose that was taken was true, s."""
+
+    @abc.abstractmethod
+    def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        """Forget everything and begin with this pose: x, y (m) and, where there is one, heading (rad)."""
+
+    @abc.abstractmethod
+    def take(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        """Correct the estimate by a pose that is newer than the last one."""
+
+    @abc.abstractmethod
+    def at(self, time: float) -> Float[np.ndarray, "d"]:
+        """Where the robot should be at a time (s) at or after `stamp`: x, y, heading."""
+
+
+@final
+class EvaderTrack(Track):
+    """The robot itself, whose commands are known: p' = u, and between poses it is where they took it.
+
+    Position and heading have a variance each, which grows by (`drift` dt)^2 + (0.1 `drift`)^2 dt between
+    poses, the motors following only to within `drift` (m/s). A command acts `lag` (s) after it was given.
+    """
+
+    def __init__(self, position_noise: float, heading_noise: float, drift: float, lag: float):
+        self._noise = max(position_noise, 1e-5) ** 2, max(heading_noise, 1e-5) ** 2
+        self._drift, self._lag = drift, lag
+        self._commands: deque[tuple[float, Float[np.ndarray, "2"]]] = deque()
+        self._pose, self._variance = np.zeros(3), (0.0, 0.0)
+
+    def told(self, time: float, velocity: Float[np.ndarray, "2"]) -> None:
+        """A command (m/s, world axes) was given at `time` (s)."""
+        self._commands.append((time + self._lag, np.array(velocity, float)))
+        while len(self._commands) > 2 and self._commands[1][0] < time - _HISTORY:
+            self._commands.popleft()
+
+    def _travelled(self, begin: float, end: float) -> Float[np.ndarray, "2"]:
+        way = np.zeros(2)
+        for i, (since, velocity) in enumerate(self._commands):
+            until = self._commands[i + 1][0] if i + 1 < len(self._commands) else math.inf
+            way += velocity * max(min(until, end) - max(since, begin), 0.0)
+        return way
+
+    def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        self.stamp, self._pose, self._variance = stamp, np.array(pose, float), self._noise
+
+    def take(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        assert self.stamp is not None
+        elapsed = stamp - self.stamp
+        expected, grown = self.at(stamp), (self._drift * elapsed) ** 2 + (0.1 * self._drift) ** 2 * elapsed
+        spread = [variance + grown for variance in self._variance]
+        gains = [own / (own + noise) for own, noise in zip(spread, self._noise, strict=True)]
+        error = pose - expected
+        self._pose = expected + np.array(
+            [gains[0] * error[0], gains[0] * error[1], gains[1] * turned(error[2])]
+        )
+        self._pose[2] = turned(self._pose[2])
+        self._variance = (spread[0] * (1.0 - gains[0]), spread[1] * (1.0 - gains[1]))
+        self.stamp = stamp
+
+    def at(self, time: float) -> Float[np.ndarray, "d"]:
+        if self.stamp is None:
+            return np.full(3, np.nan)
+        moved = self._pose.copy()
+        moved[:2] += self._travelled(self.stamp, time)
+        return moved
+
+
+@final
+class PursuerTrack(Track):
+    """A differential drive of unknown commands: an extended Kalman filter on (x, y, heading, v, omega).
+
+    Between poses it drives on at v and omega, which may change by V and V/b within about 0.1 s; they are kept
+    to what the wheels can do, |v| + b |omega| <= V.
+    """
+
+    def __init__(self, position_noise: float, heading_noise: float, rim_speed: float, half_axle: float):
+        self._noise = np.diag([max(position_noise, 1e-5) ** 2] * 2 + [max(heading_noise, 1e-5) ** 2])
+        self._rim, self._axle = rim_speed, half_axle
+        self._change = np.array([rim_speed**2, (rim_speed / half_axle) ** 2]) / _REACTION
+        self._state, self._spread = np.zeros(5), np.zeros((5, 5))
+
+    @property
+    def motion(self) -> tuple[float, float]:
+        """Speed v (m/s) and turn rate omega (rad/s)."""
+        return float(self._state[3]), float(self._state[4])
+
+    def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        self.stamp = stamp
+        self._state = np.concatenate([pose, [0.0, 0.0]])
+        self._spread = np.zeros((5, 5))
+        self._spread[:3, :3] = self._noise
+        self._spread[3, 3], self._spread[4, 4] = self._change * _REACTION
+
+    def take(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        assert self.stamp is not None
+        elapsed = stamp - self.stamp
+        state, spread = self._moved(elapsed), self._grown(elapsed)
+        error = pose - state[:3]
+        error[2] = turned(error[2])
+        gain = np.linalg.solve(spread[:3, :3] + self._noise, spread[:3]).T
+        state = state + gain @ error
+        self._spread = spread - gain @ spread[:3]
+        self._spread = 0.5 * (self._spread + self._spread.T)
+        state[2] = turned(state[2])
+        most = abs(state[3]) + self._axle * abs(state[4])
+        if most > self._rim:
+            state[3:] *= self._rim / most
+        self._state, self.stamp = state, stamp
+
+    def _moved(self, elapsed: float) -> Float[np.ndarray, "5"]:
+        """On the arc, its chord pointing along the heading half-way."""
+        x, y, heading, speed, rate = self._state
+        half = 0.5 * rate * elapsed
+        chord = speed * elapsed * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+        return np.array(
+            [x + chord * math.cos(heading + half), y + chord * math.sin(heading + half), heading + 2.0 * half,
+             speed, rate]
+        )  # fmt: skip
+
+    def _grown(self, elapsed: float) -> Float[np.ndarray, "5 5"]:
+        _, _, heading, speed, rate = self._state
+        middle = heading + 0.5 * rate * elapsed
+        cosine, sine = math.cos(middle), math.sin(middle)
+        way = speed * elapsed
+        slope = np.eye(5)
+        slope[0, 2], slope[0, 3], slope[0, 4] = -way * sine, elapsed * cosine, -0.5 * way * elapsed * sine
+        slope[1, 2], slope[1, 3], slope[1, 4] = way * cosine, elapsed * sine, 0.5 * way * elapsed * cosine
+        slope[2, 4] = elapsed
+        noise = np.zeros((5, 5))
+        # White acceleration along the heading, and in turning.
+        along = np.array([cosine * elapsed / 2.0, sine * elapsed / 2.0, 0.0, 1.0, 0.0])
+        around = np.array([0.0, 0.0, elapsed / 2.0, 0.0, 1.0])
+        noise += self._change[0] * elapsed * np.outer(along, along)
+        noise += self._change[1] * elapsed * np.outer(around, around)
+        return slope @ self._spread @ slope.T + noise
+
+    def at(self, time: float) -> Float[np.ndarray, "d"]:
+        if self.stamp is None:
+            return np.full(3, np.nan)
+        return self._moved(max(time - self.stamp, 0.0))[:3]
+
+    def wheel_speeds(self) -> Float[np.ndarray, "2"]:
+        """Left and right rim speed (m/s)."""
+        speed, rate = self.motion
+        return np.array([speed - self._axle * rate, speed + self._axle * rate])
+
+
+@final
+class ObstacleTrack(Track):
+    """A drifting obstacle: constant velocity but for a white acceleration, so that its drift is found.
+
+    `likely_speed` (m/s) is how fast obstacles tend to be, before this one was seen to move.
+    """
+
+    def __init__(self, position_noise: float, likely_speed: float, acceleration: float):
+        self._noise = max(position_noise, 1e-5) ** 2
+        self._likely, self._jerk = max(likely_speed, 1e-3) ** 2, acceleration**2
+        self._state = np.zeros((2, 2))  # position and velocity, by component
+        self._spread = np.zeros((2, 2))
+
+    @property
+    def velocity(self) -> Float[np.ndarray, "2"]:
+        """Drift, m/s."""
+        return self._state[1]
+
+    def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        self.stamp = stamp
+        self._state = np.array([pose[:2], [0.0, 0.0]])
+        self._spread = np.diag([self._noise, self._likely])
+
+    def take(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
+        assert self.stamp is not None
+        elapsed = stamp - self.stamp
+        slope = np.array([[1.0, elapsed], [0.0, 1.0]])
+        along = np.array([elapsed / 2.0, 1.0])
+        spread = slope @ self._spread @ slope.T + self._jerk * elapsed * np.outer(along, along)
+        gain = spread[:, 0] / (spread[0, 0] + self._noise)
+        state = slope @ self._state
+        self._state = state + np.outer(gain, pose[:2] - state[0])
+        self._spread = spread - np.outer(gain, spread[0])
+        self.stamp = stamp
+
+    def at(self, time: float) -> Float[np.ndarray, "d"]:
+        if self.stamp is None:
+            return np.full(2, np.nan)
+        return self._state[0] + self._state[1] * max(time - self.stamp, 0.0)
