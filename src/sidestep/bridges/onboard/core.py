@@ -14,80 +14,23 @@ from pathlib import Path
 from typing import Any, final
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sidestep._arrays import real
+from sidestep.bridges.onboard.answering import Answering, Numbers, Seen, way_out
 from sidestep.bridges.onboard.decision import LEVELS, Decision
 from sidestep.bridges.onboard.readings import Gate, Reading
 from sidestep.bridges.onboard.settings import OnboardSettings
 from sidestep.bridges.onboard.tracks import EvaderTrack, ObstacleTrack, PursuerTrack
 from sidestep.learning import load_policy
-from sidestep.learning.control_step import decide, decision_steps_of
-from sidestep.pursuit import make_pursuer, pursue
-from sidestep.safety import JointShield, PursuitBarrier, Shield, Status, make_shield
-from sidestep.safety.look_ahead import clearance, stretch, wish
+from sidestep.learning.control_step import decision_steps_of
+from sidestep.safety import JointShield, Shield, Status, make_shield
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
-from sidestep.world import Scenario, World
+from sidestep.world import Scenario
 
 _BUDGETED = ("game", "joint")
-_PLAN_POINTS = 33
 _CALM = 20
 """On-time decisions after which a core that fell behind looks ahead again."""
-
-_Numbers = Float[np.ndarray, "n"]
-
-
-@eqx.filter_jit
-def _answer(
-    shield: Any,
-    policy: Any,
-    world: World,
-    wished: Array,
-    ask: Array,
-    flee: Array,
-    delay: Array,
-    memory: Any,
-) -> tuple[Array, Any, Any, Array]:
-    """Nominal velocity, shield result, next memory, clearance.
-
-    `ask` the policy, if there is one, instead of taking the wish; `flee`: instead of either, full speed away
-    from the nearest pursuer. `delay` (s) replaces the budget's.
-    """
-    scenario: Scenario = shield.scenario
-    nominal = wished
-    if policy is not None:
-        nominal = jnp.where(ask, decide(scenario, policy, world), wished)
-    if scenario.pursuer_count:
-        barrier = PursuitBarrier()
-        rows = barrier.rows(scenario, world, barrier.remember(scenario, world))
-        away = rows.normals[jnp.argmin(rows.values)]
-        nominal = jnp.where(flee, scenario.evader_speed * away, nominal)
-    if getattr(shield, "budget", None) is not None:
-        shield = eqx.tree_at(lambda shield: shield.budget.delay, shield, delay)
-    result, memory = shield(world, nominal, memory)
-    return nominal, result, memory, clearance(scenario, world)
-
-
-@eqx.filter_jit
-def _plan(shield: JointShield, world: World, memory: Any) -> Float[Array, "n 2"]:
-    scenario, game, pursuer = shield.scenario, shield.rows_only, make_pursuer("nash")
-    steps = _PLAN_POINTS - 1
-    period = shield.horizon / steps
-    paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, period)
-
-    def step(carry: Any, count: Array) -> Any:
-        world, sides = carry
-        age = memory.age + period * count
-        wished = wish(paced, world, sides, stretch(memory.way, age, shield.horizon / len(memory.way)))
-        action, sides = game.heed(world, wished, sides)
-        moved = paced.moved(world, action, pursue(paced, pursuer, world, jax.random.key(0)))
-        return (moved, sides), moved.evader
-
-    _, way = jax.lax.scan(step, (world, memory.sides), jnp.arange(steps).astype(period.dtype))
-    return jnp.concatenate([world.evader[None], way])
 
 
 @final
@@ -126,11 +69,14 @@ class Onboard:
             budget = settings.budget if shield in _BUDGETED else None
             shield = make_shield(shield, scenario, budget)
         self._shield = shield
-        self._rows: Shield | None = shield.rows_only if isinstance(shield, JointShield) else None
+        self._init = eqx.filter_jit(shield.init)
         if isinstance(policy, (str, Path)) and policy != GOAL_SEEKING:
             policy = load_policy(policy)
         self._policy = None if policy is None else as_policy(policy, scenario)
         self._decision_steps = 1 if policy is None else decision_steps_of(self._policy)
+        self._whole = Answering(shield, self._policy)
+        rows = shield.rows_only if isinstance(shield, JointShield) else None
+        self._rows = None if rows is None else Answering(rows, self._policy)
         self._period = float(scenario.control_period)
         self._speed = float(scenario.evader_speed)
         self._target = np.full(2, np.nan) if policy is not None else np.zeros(2)
@@ -157,7 +103,7 @@ class Onboard:
         }
         self.counts: Counter[tuple[str, Reading]] = Counter()
         self._dropped: Counter[tuple[str, Reading]] = Counter()
-        self._wish: tuple[float, _Numbers] | None = None
+        self._wish: tuple[float, Numbers] | None = None
         self._held = np.full(2, np.nan)
         self._now: float | None = None
         self._begun: float | None = None
@@ -227,26 +173,16 @@ class Onboard:
         return reading
 
     def warm_up(self) -> float:
-        """Compile what decisions need, the fall-backs included; returns the seconds it took."""
+        """Compile what decisions need, the fall-back included; returns the seconds it took."""
         begun = time.perf_counter()
-        place = jnp.zeros(2)
-        world = World(
-            place,
-            jnp.full((self.scenario.pursuer_count, 3), 1.0),
-            jnp.full((self.scenario.obstacle_count, 4), 2.0),
-            place + 1.0,
-        )
-        memory = self._shield.init(world)
-        for shield, start in ((self._shield, memory), (self._rows, getattr(memory, "sides", None))):
-            if shield is not None:
-                jax.block_until_ready(self._ask(shield, world, np.zeros(2), True, False, 0.0, start))
+        m, k = self.scenario.pursuer_count, self.scenario.obstacle_count
+        place = np.zeros(2)
+        seen = Seen(place, np.full((m, 3), 1.0), np.full((k, 4), 2.0), place + 1.0, np.zeros((m, 2)), 0.0)
+        memory = self._init(seen.world())
+        self._whole(seen, place, True, False, 0.0, memory)
+        if self._rows is not None:
+            self._rows(seen, place, True, False, 0.0, memory.sides)
         return time.perf_counter() - begun
-
-    def _ask(
-        self, shield: Any, world: World, wished: Any, ask: bool, flee: bool, delay: float, memory: Any
-    ) -> tuple[Any, Any, Any, Any]:
-        flags = jnp.asarray(ask), jnp.asarray(flee)
-        return _answer(shield, self._policy, world, real(wished), *flags, real(delay), memory)
 
     def decide(self, now: float) -> Decision:
         """The command for the period that begins at `now` (s). Never raises for what was seen or wished."""
@@ -257,7 +193,7 @@ class Onboard:
             reactions.append(f"the clock went from {self._now} s to {now} s: stopped for this period")
             return self._stop(reactions, begun, now)
         lateness = self._pace(now, reactions)
-        level = max(level, int(lateness > 0.0))
+        level = max(level, int(self._late_in_a_row > 0 or self._behind))
         self._now = now
 
         acts = now + self.settings.actuation_delay
@@ -271,53 +207,47 @@ class Onboard:
             return self._stop(reactions, begun, now)
         wished, lost = self._wished(now, reactions)
         level = max(level, int(lost))
-        world = self._world(acts)
+        seen = self._estimate(acts)
         if self._memory is None:
-            self._memory = self._shield.init(world)
+            self._memory = self._init(seen.world())
         delay = max(delay, float(self.settings.budget.delay)) + lateness
-        shield, memory = self._shield, self._memory
-        if self._behind and self._rows is not None:
-            shield, memory = self._rows, self._memory.sides
-        flee = level >= LEVELS.index("evade")
         ask = self._decided % self._decision_steps == 0
-        answer = self._ask(shield, world, wished, ask, flee, delay, memory)
-        nominal, result, memory, near = jax.device_get(answer)
-        if shield is self._shield:
-            self._memory = memory
+        flee = level >= LEVELS.index("evade")
+        if self._behind and self._rows is not None:
+            answer, sides = self._rows(seen, wished, ask, flee, delay, self._memory.sides)
+            self._memory = eqx.tree_at(lambda memory: memory.sides, self._memory, sides)
         else:
-            self._memory = eqx.tree_at(lambda kept: kept.sides, self._memory, memory)
-        velocity = np.asarray(result.action, float)
-        if not np.all(np.isfinite(velocity)):
+            answer, self._memory = self._whole(seen, wished, ask, flee, delay, self._memory)
+        if not np.all(np.isfinite(answer.action)):
             reactions.append("the shield's answer was not finite: stopped for this period")
             return self._stop(reactions, begun, now)
-        self._evader.told(now, velocity)
+        self._evader.told(now, answer.action)
         self._decided += 1
-        nominal = np.asarray(nominal, float)
         if not flee:
-            self._held = nominal
+            self._held = answer.nominal
         newest = max(gate.track.stamp or -math.inf for gates in self._gates.values() for gate in gates)
         computed = time.perf_counter() - begun
         return Decision(
-            velocity=velocity,
-            nominal=nominal,
-            status=int(result.status),
+            velocity=answer.action,
+            nominal=answer.nominal,
+            status=answer.status,
             level=LEVELS[level],
             reactions=tuple(reactions),
-            barriers=np.asarray(result.barriers, float),
-            slack=float(result.slack),
-            intervention=float(result.intervention),
-            clearance=float(near),
+            barriers=answer.barriers,
+            slack=answer.slack,
+            intervention=answer.intervention,
+            clearance=answer.clearance,
             latency=now - newest + computed,
             compute_seconds=computed,
-            world=world,
-            _plan=self._planner(world, self._memory),
+            _seen=seen,
+            _plan=self._planner(seen, self._memory),
         )
 
-    def _planner(self, world: World, memory: Any) -> Callable[[], Float[np.ndarray, "n 2"]]:
+    def _planner(self, seen: Seen, memory: Any) -> Callable[[], Float[np.ndarray, "n 2"]]:
         shield = self._shield
         if not isinstance(shield, JointShield) or not self.scenario.pursuer_count:
             return lambda: np.zeros((0, 2))
-        return lambda: np.asarray(_plan(shield, world, memory), float)
+        return lambda: np.asarray(way_out(shield, seen.world(), memory), float)
 
     def _dropped_since(self) -> list[str]:
         """What was not believed since the last decision, in words."""
@@ -383,7 +313,7 @@ class Onboard:
                 reactions.append(f"{name}: stale, last seen {milliseconds:.0f} ms ago: {left}")
         return delay, level
 
-    def _wished(self, now: float, reactions: list[str]) -> tuple[_Numbers, bool]:
+    def _wished(self, now: float, reactions: list[str]) -> tuple[Numbers, bool]:
         """The wish to filter, and whether it was lost; a policy's is computed with the decision."""
         if self._policy is not None:
             return self._held, False
@@ -397,19 +327,19 @@ class Onboard:
             return np.zeros(2), True
         return wished, False
 
-    def _world(self, acts: float) -> World:
+    def _estimate(self, acts: float) -> Seen:
         """Everything as it should be when the command acts; pursuers as last seen unless told otherwise."""
         predict = self.settings.predict_pursuer
         pursuers = [track.at(acts if predict else track.stamp or acts) for track in self._pursuers]
         obstacles = [np.concatenate([track.at(acts), track.velocity]) for track in self._obstacles]
         wheels = [track.wheel_speeds() for track in self._pursuers]
-        return World(
+        return Seen(
             evader=self._evader.at(acts)[:2],
             pursuers=np.array(pursuers).reshape(-1, 3),
             obstacles=np.array(obstacles).reshape(-1, 4),
             target=self._target,
-            time=np.float64(self._decided * self._period),
             wheel_speeds=np.array(wheels).reshape(-1, 2),
+            time=self._decided * self._period,
         )
 
     def _stop(self, reactions: list[str], begun: float, now: float) -> Decision:
@@ -429,7 +359,7 @@ class Onboard:
             clearance=math.nan,
             latency=math.nan,
             compute_seconds=computed,
-            world=None,
+            _seen=None,
             _plan=lambda: np.zeros((0, 2)),
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +26,6 @@ class Decision:
     - `barriers (m + k,)` h in m; `slack` m/s; `intervention` |velocity - nominal| in m/s; `clearance` least
       distance (m) to contact, as estimated
     - `latency` from the newest pose used to the end of the decision, s; `compute_seconds` of it spent here
-    - `world` the estimate decided on, or None where there was none
     """
 
     velocity: Float[np.ndarray, "2"]
@@ -39,8 +39,13 @@ class Decision:
     clearance: float
     latency: float
     compute_seconds: float
-    world: World | None
+    _seen: Any = field(repr=False, compare=False)
     _plan: Callable[[], Float[np.ndarray, "n 2"]] = field(repr=False, compare=False)
+
+    @property
+    def world(self) -> World | None:
+        """The estimate decided on, at the time when the command acts; None where there was none."""
+        return None if self._seen is None else self._seen.world()
 
     @property
     def plan(self) -> Float[np.ndarray, "n 2"]:
