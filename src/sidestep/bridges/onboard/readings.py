@@ -77,4 +77,5 @@ class Gate:
             return False
         if len(new) < 3:
             return True
-        return abs(turned(new[2] - old[2])) <= self._turn_rate * elapsed + settings.heading_tolerance
+        turned_by = abs(turned(float(new[2] - old[2])))
+        return turned_by <= self._turn_rate * elapsed + settings.heading_tolerance

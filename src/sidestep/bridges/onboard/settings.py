@@ -20,7 +20,8 @@ class OnboardSettings:
     of the delay that passes between a decision and the motors: the own motion is predicted up to there.
     `predict_pursuer`: also drive the pursuer on from its last pose at the speeds that it seems to have. What
     is guaranteed holds without (an old pose is the same game, `budget.delay` pays for it); with it, a pursuer
-    that drives steadily is met better and one that turns round within the delay worse.
+    that drives steadily is met better and one that turns round within the delay worse. An obstacle's drift is
+    taken to wander by `obstacle_acceleration` (m/s per root second).
 
     **Faults.** A robot's pose older than `stale_after` (s), or a decision core that was called late
     `late_limit` times running (later than `late_after` periods), is a fault. `on_fault` says what is left.
@@ -34,7 +35,7 @@ class OnboardSettings:
     heading_noise: float = 0.005
     actuation_delay: float = 0.0
     predict_pursuer: bool = False
-    obstacle_acceleration: float = 0.02
+    obstacle_acceleration: float = 0.005
     stale_after: float = 0.2
     nominal_timeout: float = 0.5
     on_fault: str = "evade"

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 _HISTORY = 5.0
 """Commands are remembered for so long (s)."""
-_REACTION = 0.1
+_REACTION = 0.25
 """Within about this time (s) a pursuer's wheels go from rest to full speed, as far as its filter knows."""
 
 
@@ -101,8 +101,8 @@ class EvaderTrack(Track):
 class PursuerTrack(Track):
     """A differential drive of unknown commands: an extended Kalman filter on (x, y, heading, v, omega).
 
-    Between poses it drives on at v and omega, which may change by V and V/b within about 0.1 s; they are kept
-    to what the wheels can do, |v| + b |omega| <= V.
+    Between poses it drives on at v and omega, which may change by V and V/b within about 0.25 s; they are
+    kept to what the wheels can do, |v| + b |omega| <= V.
     """
 
     def __init__(self, position_noise: float, heading_noise: float, rim_speed: float, half_axle: float):

@@ -1,0 +1,227 @@
+"""The decision core under every fault: never an unfiltered command, never an exception, always a word."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sidestep.bridges.onboard import Onboard, OnboardSettings, Reading
+from sidestep.safety import Budget, BudgetWarning, JointShield, Status
+from sidestep.world import load_scenario
+
+PERIOD = 0.05
+SCENARIO = load_scenario("paper", capture_distance=0.15)
+# The pursuer stands across, so that straight away from it is the way to flee.
+ACROSS = math.pi / 2.0
+FAR = {"pursuer": (3.0, 0.0, ACROSS), "obstacle": (0.0, 3.0)}
+WISH = np.array([0.1, 0.05])
+
+
+@pytest.fixture(scope="module")
+def core():
+    made = Onboard(SCENARIO, "game")
+    made.warm_up()
+    return made
+
+
+@pytest.fixture
+def onboard(core):
+    core.reset()
+    return core
+
+
+def run(onboard, periods, begin=0, *, pursuer=FAR["pursuer"], without=(), wish=WISH, decide=True):
+    """Feed everything but `without` and decide, once a period; the last decision."""
+    decision = None
+    for count in range(begin, begin + periods):
+        now = PERIOD * count
+        for robot, pose in (("evader", (0.0, 0.0, 0.0)), ("pursuer", pursuer), ("obstacle", FAR["obstacle"])):
+            if robot not in without:
+                onboard.see(robot, now, pose)
+        if "nominal" not in without:
+            onboard.nominal(now, wish)
+        decision = onboard.decide(now) if decide else None
+    return decision
+
+
+def test_all_is_well_and_the_wish_passes_unchanged(onboard):
+    decision = run(onboard, 3)
+    assert (decision.level, decision.reactions, decision.status) == ("normal", (), Status.OK)
+    np.testing.assert_allclose(decision.velocity, WISH, atol=1e-7)
+    assert decision.clearance == pytest.approx(2.8, abs=0.02)
+    np.testing.assert_allclose(decision.barriers, [2.85, 2.8], atol=0.02)
+    assert 0.0 < decision.compute_seconds <= decision.latency
+    assert decision.world.pursuers.shape == (1, 3)
+
+
+def test_before_every_robot_has_been_seen_it_stands_still_and_says_which_it_waits_for(onboard):
+    decision = run(onboard, 2, without=("pursuer",))
+    assert decision.level == "stop"
+    assert decision.status == Status.INVALID
+    assert "pursuer 0" in decision.reactions[0]
+    assert not np.any(decision.velocity)
+
+
+@pytest.mark.parametrize("robot", ["evader", "pursuer", "obstacle"])
+def test_a_pose_that_stops_coming_degrades_first_and_then_leaves_the_wish_alone(onboard, robot):
+    run(onboard, 5)
+    soon = run(onboard, 3, 5, without=(robot,))
+    assert soon.level == "degraded"
+    assert "last seen" in soon.reactions[0]
+    late = run(onboard, 4, 8, without=(robot,))
+    assert late.level == ("stop" if robot == "evader" else "evade")
+    assert "stale" in late.reactions[0]
+    # Full speed away from the pursuer, which is at +x.
+    expected = (0.0, 0.0) if robot == "evader" else (-0.1574, 0.0)
+    np.testing.assert_allclose(late.velocity, expected, atol=0.005)
+    assert run(onboard, 2, 12).level == "normal"
+
+
+def test_a_pursuer_unseen_for_longer_is_kept_farther_away(onboard):
+    near = (-0.35, 0.0, 0.0)
+    at_once = run(onboard, 4, pursuer=near, wish=np.zeros(2))
+    unseen = run(onboard, 3, 4, without=("pursuer",), wish=np.zeros(2))
+    assert unseen.velocity[0] > at_once.velocity[0] + 0.01
+
+
+def test_stopping_may_be_configured_instead_of_fleeing():
+    careful = Onboard(SCENARIO, "none", settings=OnboardSettings(on_fault="stop"))
+    run(careful, 3)
+    decision = run(careful, 6, 3, without=("pursuer",))
+    assert decision.level == "stop"
+    assert not np.any(decision.velocity)
+
+
+@pytest.mark.parametrize(
+    "stamp, pose, reading",
+    [
+        (0.2, (math.nan, 0.0, ACROSS), Reading.NOT_FINITE),
+        (math.inf, (3.0, 0.0, ACROSS), Reading.NOT_FINITE),
+        (0.01, (3.0, 0.0, ACROSS), Reading.OUT_OF_ORDER),
+        (0.1, (3.0, 0.0, ACROSS), Reading.OUT_OF_ORDER),
+        (0.12, (2.5, 0.0, ACROSS), Reading.JUMP),
+        (0.12, (3.0, 0.0, -1.0), Reading.JUMP),
+        (99.0, (3.0, 0.0, ACROSS), Reading.FROM_THE_FUTURE),
+    ],
+)
+def test_a_bad_pose_changes_nothing_but_is_told_of(onboard, stamp, pose, reading):
+    before = run(onboard, 3).world.pursuers
+    assert onboard.see("pursuer", stamp, pose) is reading
+    decision = onboard.decide(0.14)
+    assert decision.reactions[0] == f"pursuer 0: 1 {reading.value}, dropped"
+    np.testing.assert_allclose(decision.world.pursuers, before, atol=1e-6)
+    assert onboard.counts[("pursuer 0", reading)] == 1
+    assert onboard.decide(0.145).reactions == ()
+
+
+def test_a_robot_that_was_carried_elsewhere_is_believed_once_its_poses_agree(onboard):
+    run(onboard, 3)
+    for i in range(5):
+        reading = onboard.see("pursuer", 0.11 + 0.005 * i, (1.0, 1.0, ACROSS))
+        assert reading is (Reading.JUMP if i < 4 else Reading.ACCEPTED)
+    decision = onboard.decide(0.15)
+    assert any("begins anew" in words for words in decision.reactions)
+    np.testing.assert_allclose(decision.world.pursuers[0, :2], [1.0, 1.0], atol=1e-6)
+
+
+def test_single_outliers_in_a_row_that_contradict_each_other_are_never_believed(onboard):
+    run(onboard, 3)
+    for i in range(20):
+        pose = (1.0 + (i % 2), 1.0, 0.0)
+        assert onboard.see("pursuer", 0.11 + 0.005 * i, pose) is Reading.JUMP
+
+
+def test_robots_that_the_scenario_does_not_have_are_refused(onboard):
+    assert onboard.see("pursuer", 0.0, (0, 0, 0), index=1) is Reading.UNKNOWN_ROBOT
+    assert onboard.see("rabbit", 0.0, (0, 0, 0)) is Reading.UNKNOWN_ROBOT
+    with pytest.raises(ValueError, match="pose of evader"):
+        onboard.see("evader", 0.0, (0.0, 0.0))
+
+
+def test_a_lost_wish_is_a_wish_to_stand_still_unless_something_presses(onboard):
+    decision = run(onboard, 2, without=("nominal",))
+    assert "no nominal velocity yet" in decision.reactions[0]
+    run(onboard, 3, 2)
+    decision = run(onboard, 12, 5, without=("nominal",))
+    assert decision.level == "degraded"
+    assert "nominal velocity lost" in decision.reactions[0]
+    assert not np.any(decision.velocity)
+    onboard.reset()
+    pressed = run(onboard, 3, pursuer=(-0.25, 0.0, 0.0), without=("nominal",))
+    assert pressed.velocity[0] > 0.05
+
+
+@pytest.mark.parametrize("wish", [(math.nan, 0.0), (0.0, math.inf)])
+def test_a_wish_that_is_no_number_is_dropped_and_the_last_one_goes_on(onboard, wish):
+    run(onboard, 3)
+    assert onboard.nominal(0.12, wish) is Reading.NOT_FINITE
+    decision = onboard.decide(0.15)
+    np.testing.assert_allclose(decision.velocity, WISH, atol=1e-7)
+    assert decision.reactions == ("nominal: 1 not finite, dropped",)
+    assert onboard.nominal(0.05, WISH) is Reading.OUT_OF_ORDER
+
+
+def test_a_late_cycle_is_said_and_allowed_for_and_forgotten_again(onboard):
+    near = {"pursuer": (-0.33, 0.0, 0.0), "wish": np.zeros(2)}
+    in_time = run(onboard, 3, **near)
+    late = run(onboard, 1, 5, **near)
+    assert late.level == "degraded"
+    assert late.reactions == ("late by 100.0 ms: allowed for as delay",)
+    assert late.velocity[0] > in_time.velocity[0] + 0.005
+    calm = run(onboard, 60, 6, **near)
+    assert calm.level == "normal"
+    assert calm.velocity[0] < late.velocity[0] - 0.005
+
+
+def test_a_clock_that_goes_back_stops_it_for_that_period_only(onboard):
+    run(onboard, 3)
+    back = onboard.decide(0.02)
+    assert back.level == "stop"
+    assert "clock went" in back.reactions[-1]
+    assert onboard.decide(math.nan).level == "stop"
+    assert run(onboard, 1, 3).level == "normal"
+
+
+def test_random_garbage_never_raises_and_never_lets_a_command_out_of_the_limits(onboard):
+    rng = np.random.default_rng(0)
+    strange = [math.nan, math.inf, -math.inf, 1e30, -1e30, 0.0, 1e-30]
+    for count in range(300):
+        for robot in ("evader", "pursuer", "obstacle", "nobody"):
+            pose = [rng.choice(strange) if rng.random() < 0.2 else rng.normal() for _ in range(3)]
+            stamp = rng.choice(strange) if rng.random() < 0.1 else PERIOD * count - rng.random() * 0.1
+            onboard.see(robot, stamp, pose[: 2 if robot == "obstacle" else 3], int(rng.integers(-1, 2)))
+        onboard.nominal(PERIOD * count, rng.choice(strange, 2) if rng.random() < 0.3 else rng.normal(size=2))
+        decision = onboard.decide(PERIOD * count + (rng.normal() if rng.random() < 0.1 else 0.0))
+        assert np.all(np.isfinite(decision.velocity))
+        assert np.hypot(*decision.velocity) <= 0.1574 * (1.0 + 1e-6)
+        assert decision.level in ("normal", "degraded", "evade", "stop")
+
+
+def test_a_core_that_keeps_falling_behind_goes_without_looking_ahead_until_it_keeps_pace():
+    # One model of the pursuer: what is compiled is smaller.
+    shield = JointShield(SCENARIO, budget=Budget(), models=("nash",))
+    core = Onboard(SCENARIO, shield, "goal-seeking")
+    core.target = (2.0, 1.0)
+    with pytest.raises(ValueError, match="policy of its own"):
+        core.nominal(0.0, WISH)
+    run(core, 3, without=("nominal",))
+    for count in (5, 7, 9):
+        decision = run(core, 1, count, without=("nominal",))
+    assert decision.reactions[-1] == "fell behind: rows only, no look-ahead"
+    # Toward the target all the same.
+    np.testing.assert_allclose(decision.velocity, 0.1574 * np.array([2.0, 1.0]) / 5.0**0.5, atol=1e-4)
+    assert run(core, 25, 10, without=("nominal",)).reactions == ()
+    near = run(core, 40, 35, pursuer=(-0.3, 0.0, 0.0), without=("nominal",))
+    assert near.plan.shape == (33, 2)
+    assert np.all(np.hypot(*np.diff(near.plan, axis=0).T) <= 0.1574 * 8.0 / 32 * 1.01)
+
+
+def test_settings_and_targets_that_cannot_be_are_refused_with_all_that_is_wrong():
+    with pytest.raises(ValueError, match=r"position_noise.*late_limit.*on_fault"):
+        OnboardSettings(position_noise=-1.0, late_limit=0, on_fault="panic")
+    with pytest.raises(ValueError, match="heading_error"):
+        Onboard(SCENARIO, "game", settings=OnboardSettings(budget=Budget(heading_error=9.0)))
+    with pytest.warns(BudgetWarning, match="exceeds"):
+        Onboard(load_scenario("paper"), "game", settings=OnboardSettings(budget=Budget(delay=0.1)))
+    with pytest.raises(ValueError, match="target"):
+        Onboard(SCENARIO, "none").target = (0.0, math.nan)
