@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from sidestep.commands import bench, certify, evaluate, falsify, report, reproduce, train
+from sidestep.commands import bench, certify, evaluate, falsify, report, reproduce, train, twin
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
@@ -18,6 +18,7 @@ _RUN: dict[type, Callable[..., int]] = {
     certify.Certify: certify.run,
     falsify.Falsify: falsify.run,
     report.Report: report.run,
+    twin.Twin: twin.run,
     bench.Bench: bench.run,
 }
 
@@ -31,6 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[certify.Certify, subcommand("certify")]
         | Annotated[falsify.Falsify, subcommand("falsify")]
         | Annotated[report.Report, subcommand("report")]
+        | Annotated[twin.Twin, subcommand("twin")]
         | Annotated[bench.Bench, subcommand("bench")],
         prog="sidestep",
         description="Safe reinforcement learning for a robot that is being pursued.",

@@ -7,6 +7,7 @@ from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
 from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
+from sidestep.views.twin_figure import twin_figure
 
 __all__ = [
     "CAPTURE_FILE",
@@ -25,5 +26,6 @@ __all__ = [
     "safety_table",
     "scenes_figure",
     "trajectory_figure",
+    "twin_figure",
     "write_report",
 ]

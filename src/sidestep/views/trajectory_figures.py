@@ -73,17 +73,17 @@ def trajectory_figure(
     if moment is not None:
         period = int(np.clip(round(moment / float(scenario.control_period)), 0, trajectory.length))
     with house_style():
-        low, high = _extent(trajectory)
-        spans = high - low + 2 * _margin(scenario)
+        low, high = scene_extent(trajectory)
+        spans = high - low + 2 * scene_margin(scenario)
         # As high as the scene needs at full width, within reason.
         scene_height = float(np.clip((WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
         figure = new_figure(WIDTH, scene_height + 3.75)
         scene, key, barriers, corrections, answers = figure.subplots(
             5, 1, height_ratios=[scene_height + 0.4, 0.4, 1.3, 0.85, 0.16]
         )
-        norm = _correction_norm(scenario)
+        norm = correction_norm(scenario)
         draw_scene(scene, scenario, trajectory, norm, shield=shield, period=period)
-        _scene_legend(key, trajectory)
+        scene_legend(key, trajectory)
         _draw_barriers(barriers, scenario, trajectory, period)
         _draw_corrections(corrections, scenario, trajectory, norm, period)
         _draw_answers(answers, scenario, trajectory)
@@ -113,11 +113,11 @@ def scenes_figure(
     **Arguments:** `trajectories` by name of shield.
     """
     with house_style():
-        norm = _correction_norm(scenario)
-        extents = [_extent(trajectory) for trajectory in trajectories.values()]
+        norm = correction_norm(scenario)
+        extents = [scene_extent(trajectory) for trajectory in trajectories.values()]
         low = np.min([extent[0] for extent in extents], axis=0)
         high = np.max([extent[1] for extent in extents], axis=0)
-        spans = high - low + 2 * _margin(scenario)
+        spans = high - low + 2 * scene_margin(scenario)
         # Two columns from three scenes on: one below the other they would not fit a page.
         count, columns = len(trajectories), 1 if len(trajectories) <= 2 else 2
         rows = -(-count // columns)
@@ -140,7 +140,7 @@ def scenes_figure(
             if index % columns:
                 one.set_ylabel("")
                 one.tick_params(labelleft=False)
-        _scene_legend(key, next(iter(trajectories.values())))
+        scene_legend(key, next(iter(trajectories.values())))
         bar = figure.colorbar(
             ScalarMappable(norm, correction_colours()), ax=[*axes, key], shrink=0.4, aspect=25, pad=0.015
         )
@@ -150,16 +150,18 @@ def scenes_figure(
         return save(figure, path)
 
 
-def _correction_norm(scenario: Scenario) -> Normalize:
+def correction_norm(scenario: Scenario) -> Normalize:
     """From nothing to a full reversal, so that colours mean the same in every figure."""
     return Normalize(0.0, 2.0 * float(scenario.evader_speed))
 
 
-def _margin(scenario: Scenario) -> float:
+def scene_margin(scenario: Scenario) -> float:
+    """Room (m) around everything that moved, for the circles around robots."""
     return max(float(scenario.capture_distance), float(scenario.collision_distance)) + 0.08
 
 
-def _extent(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def scene_extent(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest x and y (m) of anything that moved, and of the target."""
     worlds = trajectory.worlds
     points = np.concatenate(
         [
@@ -185,7 +187,8 @@ def draw_scene(
     """Everything that moved, with time marks; capture and level sets at control period `period`."""
     period = tightest_period(trajectory) if period is None else period
     world = world_at(trajectory, period)
-    set_limits(axes, np.stack(limits if limits is not None else _extent(trajectory)), _margin(scenario))
+    corners = limits if limits is not None else scene_extent(trajectory)
+    set_limits(axes, np.stack(corners), scene_margin(scenario))
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     draw_barrier_levels(axes, scenario, world, pursuit=shield in _PURSUIT_SHIELDS)
@@ -224,7 +227,7 @@ def draw_scene(
         )
 
 
-def _scene_legend(axes: Axes, trajectory: Trajectory) -> None:
+def scene_legend(axes: Axes, trajectory: Trajectory) -> None:
     """The key, in axes of its own, where it cannot cover anything."""
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),

@@ -1,0 +1,27 @@
+"""How would it go on robots? The scenario in a physics simulator: motors, wheels, noise and delay."""
+
+from sidestep.bridges.twin.episode import TwinEpisode, run_twin, settings_for
+from sidestep.bridges.twin.library import TwinError
+from sidestep.bridges.twin.options import PURSUER_SEES, TwinOptions
+from sidestep.bridges.twin.robots import BASES
+from sidestep.bridges.twin.sensors import SENSORS, Measurement, Sensors, make_sensors
+from sidestep.bridges.twin.twin import Contacts, Twin
+from sidestep.bridges.twin.video import frames_of, write_video
+
+__all__ = [
+    "BASES",
+    "PURSUER_SEES",
+    "SENSORS",
+    "Contacts",
+    "Measurement",
+    "Sensors",
+    "Twin",
+    "TwinEpisode",
+    "TwinError",
+    "TwinOptions",
+    "frames_of",
+    "make_sensors",
+    "run_twin",
+    "settings_for",
+    "write_video",
+]
