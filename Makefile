@@ -52,7 +52,8 @@ test: $(READY) ## Run the tests (those marked slow: make test ARGS='-m slow')
 	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)
 
 test-ros: $(ROS_READY) ## Test the ROS 2 package with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
-	$(PY) ros2/private_network.py $(ROS_PY) -m pytest -q -c ros2/sidestep_ros/pytest.ini ros2/sidestep_ros/test $(ARGS)
+	$(PY) ros2/private_network.py $(ROS_PY) -m pytest -q -c ros2/sidestep_ros/pytest.ini -n $(JOBS) --dist loadfile \
+	  ros2/sidestep_ros/test $(ARGS)
 
 # ROS 2 as wheels, in an environment of its own that sees the other's packages.
 $(ROS_READY): requirements-ros.lock | $(READY)

@@ -55,7 +55,7 @@ def heard(robots, about, words, wanted=None):
                 return statuses[about]
         return None
 
-    return wait_until(found, f"'{words}' in the diagnostics on {about}", 20.0)
+    return wait_until(found, f"'{words}' in the diagnostics on {about}", 60.0)
 
 
 def with_stamp(robots, ahead):
@@ -209,7 +209,7 @@ def test_wish_into_the_pursuer_is_not_let_through(live):
     x, y, _ = live.poses["evader"]
     live.poses["pursuer"][:2] = x + 0.28, y
     live.nominal = (SPEED, 0.0)
-    wait_until(lambda: live.command()[0] < 0.2 * SPEED, "a correction", 20.0)
+    wait_until(lambda: live.command()[0] < 0.2 * SPEED, "a correction")
     live.nominal = (0.0, -0.02)
     live.poses["pursuer"][:2] = x + 1.2, y + 0.6
     heard(live, "decisions", "somewhere else")

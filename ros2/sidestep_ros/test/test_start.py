@@ -59,7 +59,7 @@ def test_policy_node_compiles_nothing_in_its_loop_and_takes_only_targets_that_ca
     def change(name, value):
         wanted = [Parameter(name, value=value).to_parameter_msg()]
         answer = client.call_async(SetParameters.Request(parameters=wanted))
-        wait_until(answer.done, f"an answer about {name}", 20.0)
+        wait_until(answer.done, f"an answer about {name}")
         return answer.result().results[0]
 
     assert change("target", [0.2, -1.0]).successful
