@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from sidestep.commands import bench, certify, evaluate, falsify, report, reproduce, train, twin
+from sidestep._compiled import keep_compiled_programs
+from sidestep.commands import bench, certify, evaluate, export, falsify, report, reproduce, train, twin
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
@@ -18,6 +19,7 @@ _RUN: dict[type, Callable[..., int]] = {
     certify.Certify: certify.run,
     falsify.Falsify: falsify.run,
     report.Report: report.run,
+    export.Export: export.run,
     twin.Twin: twin.run,
     bench.Bench: bench.run,
 }
@@ -32,6 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[certify.Certify, subcommand("certify")]
         | Annotated[falsify.Falsify, subcommand("falsify")]
         | Annotated[report.Report, subcommand("report")]
+        | Annotated[export.Export, subcommand("export")]
         | Annotated[twin.Twin, subcommand("twin")]
         | Annotated[bench.Bench, subcommand("bench")],
         prog="sidestep",
@@ -40,6 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     from rich.console import Console
 
+    keep_compiled_programs()
     try:
         return _RUN[type(command)](command, Console())
     except ValueError as error:
