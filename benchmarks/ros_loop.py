@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=20.0, help="control periods per second")
     parser.add_argument("--shield", default="joint", choices=("paper", "game", "joint"))
     parser.add_argument("--physics", default="plain", choices=("plain", "mujoco"))
+    parser.add_argument("--sensors", default="perfect", help="of mujoco; others add a delay of their own")
     parser.add_argument("--pursuer", default="nash")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
@@ -59,7 +60,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         _start("policy_node", *common, f"shield:={options.shield}", "diagnostics_period:=0.0"),
         _start(
             "twin_node", *common, f"physics:={options.physics}", f"pursuer:={options.pursuer}",
-            f"seed:={options.seed}",
+            f"seed:={options.seed}", f"sensors:={options.sensors}",
         ),
     ]  # fmt: skip
     rclpy.init()

@@ -227,7 +227,13 @@ POLICY = (
 TWIN = (
     Parameter("physics", "plain", "MuJoCo, or the plain simulation.", choices=("mujoco", "plain")),
     Parameter("pursuer", "nash", "Strategy of the pursuers."),
-    Parameter("pose_rate", 0.0, "Sets of poses per second; 0.0: one per control period.", 0.0, 1000.0),
+    Parameter(
+        "pose_rate",
+        0.0,
+        "Sets of poses per second; 0.0: one per control period, or as sensors do.",
+        0.0,
+        1000.0,
+    ),
     Parameter("sensors", "motion-capture", "How MuJoCo's poses are measured: a preset of the twin."),
     Parameter("base", "servo", "The evader's base in MuJoCo."),
     Parameter("seed", 0, "Seed of starts, targets and noise.", 0, 2**31 - 1),

@@ -30,7 +30,9 @@ class Contacts:
 
 
 class Physics(abc.ABC):
-    """Robots that move as they were last told, for as long as one lets them."""
+    """Robots that move as they were last told, for as long as one lets them; `pose_rate` in Hz."""
+
+    pose_rate: float
 
     @abc.abstractmethod
     def reset(self, world: Any, seed: int) -> None:
@@ -74,6 +76,7 @@ class PlainPhysics(Physics):
             return moved, events, clearance
 
         self._step = step
+        self.pose_rate = 1.0 / float(scenario.control_period)
         self._first_heading = heading
 
     def reset(self, world: Any, seed: int) -> None:
@@ -122,9 +125,11 @@ class MujocoPhysics(Physics):
 
         self._scenario = scenario
         try:
-            self._twin = Twin(scenario, TwinOptions(base=base, sensors=make_sensors(sensors)), seed)
+            options = TwinOptions(base=base, sensors=make_sensors(sensors))
+            self._twin = Twin(scenario, options, seed)
         except TwinError as error:
             raise ConfigurationError([str(error)]) from error
+        self.pose_rate = options.sensors.rate
 
     def reset(self, world: Any, seed: int) -> None:
         self._twin.reset(world, seed)

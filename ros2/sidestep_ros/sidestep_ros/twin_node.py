@@ -60,8 +60,8 @@ class TwinNode(Node):
         self.create_subscription(
             COMMAND_TYPES[self._commands.kind], self.values["command.topic"], self._obey, quality.COMMANDS
         )
-        every = 1.0 / self.values["pose_rate"] if self.values["pose_rate"] else self._period
-        self.create_timer(every, self._tick, clock=self._times.timer_clock)
+        rate = self.values["pose_rate"] or self._physics.pose_rate
+        self.create_timer(1.0 / rate, self._tick, clock=self._times.timer_clock)
         self.create_timer(_REPORT_SECONDS, self._report, clock=self._times.timer_clock)
         self._moved_at = self._times.of_cycle()
         self.get_logger().info("ready")
