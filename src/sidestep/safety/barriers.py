@@ -20,9 +20,12 @@ from sidestep.world.robots import body_velocity, drive
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
-_KEEP_SIDE = 0.5
-_STEEPER = 1.5
-_LOST_SIDE = 0.005
+KEEP_SIDE = 0.5
+"""Share of the width across the axis within which a side's row is feasible, up to which the side is kept."""
+STEEPER = 1.5
+"""How much steeper than needed alpha is beyond h_max."""
+LOST_SIDE = 0.005
+"""Width across the axis, in capture distances, within which a side is kept where none can save the evader."""
 _DECIDED = 0.1
 
 _NormalAndRate: TypeAlias = tuple[Float[Array, "2 *lanes"], Float[Array, "*lanes"]]
@@ -323,7 +326,7 @@ class PursuitBarrier(Barrier):
         gain, axle = scenario.pursuer_gain, game.half_axle
         spare = jnp.maximum(game.largest_capture_distance - game.capture_distance, 0.0)
         turning = game.pursuer_speed * jnp.tan(game.usable_angle) / jnp.where(axle > 0.0, axle, 1.0)
-        steep = jnp.maximum(gain, jnp.where(axle > 0.0, _STEEPER * turning, 0.0))
+        steep = jnp.maximum(gain, jnp.where(axle > 0.0, STEEPER * turning, 0.0))
         back = gain * jnp.minimum(h + self.eased, 0.0)
         return gain * jnp.clip(h, 0.0, spare) + steep * jnp.maximum(h - spare, 0.0) + back
 
@@ -380,10 +383,10 @@ class PursuitBarrier(Barrier):
 
         h = ahead * cosine - across * sine - game.capture_distance
         own = ahead * cosine + across * sine - game.capture_distance
-        feasible = (h >= 0.0) & (across <= _KEEP_SIDE * reach(h))
+        feasible = (h >= 0.0) & (across <= KEEP_SIDE * reach(h))
         # With no side left to save it, the evader still does best to commit to one.
         lost = (own < 0.0) | (reach(own) < 0.0)
-        return in_front & (feasible | (lost & (across <= _LOST_SIDE * game.capture_distance)))
+        return in_front & (feasible | (lost & (across <= LOST_SIDE * game.capture_distance)))
 
 
 BARRIERS: dict[str, Barrier] = {

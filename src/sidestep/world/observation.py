@@ -26,8 +26,8 @@ from sidestep.world.robots import limit_speed
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
-_NEAR_TARGET = 0.25
-_NEAR_ROBOT = 0.2
+FAR_TARGET, NEAR_TARGET, NEAR_ROBOT = 2.0, 0.25, 0.2
+"""Scales (m) of the far and near view of the target, and of clearances."""
 
 
 def observation_size(scenario: Scenario) -> int:
@@ -70,7 +70,7 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
     axes = frame_axes(scenario, world.evader, world.target)
     x, y = world.target[0] - world.evader[0], world.target[1] - world.evader[1]
     distance = length(x, y)
-    entries = [jnp.tanh(distance / 2.0), jnp.exp(-distance / _NEAR_TARGET)]
+    entries = [jnp.tanh(distance / FAR_TARGET), jnp.exp(-distance / NEAR_TARGET)]
     if scenario.frame == "world":
         far = jnp.where(distance > 0.0, distance, 1.0)
         entries += [jnp.where(distance > 0.0, x / far, 0.0), jnp.where(distance > 0.0, y / far, 0.0)]
@@ -92,7 +92,7 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
             squash = 1.0 / (1.0 + distance)
             told += along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash)
             told += along(*extra(robot))
-            told.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / _NEAR_ROBOT))
+            told.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / NEAR_ROBOT))
         return told
 
     def heading(robot: Any) -> tuple[Lanes, Lanes]:

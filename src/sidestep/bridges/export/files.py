@@ -1,0 +1,61 @@
+"""What an export writes, and what it needs installed to do so."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import sidestep
+from sidestep.learning.records import write_bytes
+from sidestep.world import Scenario
+from sidestep.world.loading import scenario_to_dict
+
+UNITS = "positions m, velocities m/s, headings rad counter-clockwise; world axes, x forward, y left"
+STATUS_WORDS = "0 ok, 1 corrected, 2 infeasible, 3 invalid"
+
+
+def load(name: str) -> Any:
+    """The module `name`. **Raises** `ValueError` with the command to type when it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ValueError(
+            f"exporting needs the package '{name.partition('.')[0]}', which cannot be imported ({error}); "
+            "install it with: pip install 'sidestep[export]'"
+        ) from error
+
+
+def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:
+    """Write a file whole or not at all. **Raises** `ValueError` where there is one and `overwrite` is not
+    set."""
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists already; give another file, or --overwrite to replace it")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, content)
+    return path
+
+
+def facts(scenario: Scenario, what: str, shield: str | None, **more: Any) -> dict[str, Any]:
+    """What an exported file says about itself, as plain JSON values."""
+    about = {
+        "sidestep": sidestep.__version__,
+        "what": what,
+        "units": UNITS,
+        "scenario": scenario_to_dict(scenario),
+        "control_period": float(scenario_to_dict(scenario)["control_period"]),
+    }
+    if shield is not None:
+        about |= {"shield": shield, "status": STATUS_WORDS}
+    return about | more
+
+
+def as_text(about: Mapping[str, Any]) -> dict[str, str]:
+    """The same as text by name, for a file format that holds only that: JSON where it is not text already."""
+    return {
+        name: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        for name, value in sorted(about.items())
+    }

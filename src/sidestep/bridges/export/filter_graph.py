@@ -1,0 +1,84 @@
+"""The exact filter as a graph: see `sidestep.safety.project`.
+
+Candidates are the wish itself and, on each row's line, the point nearest to it that the other rows and the
+disc allow. What a candidate breaks costs so much more than its distance that the cheapest is the answer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sidestep.bridges.export.graph import Graph, Tensor
+from sidestep.bridges.export.levels_graph import Row, relaxed
+
+_EPS = float(np.finfo(np.float32).eps)
+TOLERANCE = 16.0 * _EPS
+"""Largest violation of a row, in units of the speed limit, that counts as kept; as
+`sidestep.safety.tolerance`."""
+_ROUNDING = 8.0 * _EPS
+_VOID = 1e30
+_PRICE = 1e12
+_FEASIBLE = 8.0
+_HARDER = 16.0
+
+
+def closest(
+    graph: Graph, start: Tensor, rows: list[Row], hard: int, wish: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The nearest velocity to a wish that keeps all rows, in units of the speed limit.
+
+    **Arguments:** `start (batch, 1, 2)` the wish, or its projection on the unit disc, and then the `wish`
+    itself; `rows` as in `rows_graph`, of which the first `hard` are kept first where not all can be.
+
+    **Returns** the velocity `(batch, 2)`, whether it is another than `start` (0 or 1, `(batch, 1)`), and
+    `(batch, 1, 1)` more than 0 where the rows cannot all hold.
+    """
+    count = len(rows)
+    normals = graph.join(*(normal for normal, _ in rows), axis=1)
+    offsets = graph.join(*(offset for _, offset in rows), axis=1)
+    kept = graph.join(*relaxed(graph, rows, hard), axis=1)
+    given_way = (offsets - kept).over("ReduceMax", axis=1) - TOLERANCE
+    columns, limits = normals.transpose(0, 2, 1), kept.reshape(0, 1, count)
+    points = _on_lines(graph, start if wish is None else wish, normals, columns, kept, limits)
+    candidates = graph.join(start, points, axis=1)
+
+    missed = graph.join(candidates @ columns + limits, candidates.over("ReduceL2"))
+    allowed = np.array([TOLERANCE] * count + [1.0 + TOLERANCE])
+    price = _PRICE * np.array([_HARDER] * hard + [1.0] * (count - hard) + [_HARDER])
+    broken = ((missed - allowed) * price).over("ReduceMax").apply("Relu")
+    cost = broken + _distance(graph, candidates, start, wish)
+    best = graph.op("ArgMin", cost, axis=1, keepdims=0)
+    moved = graph.least(graph.op("Cast", best, to=1), 1.0)
+    infeasible = graph.largest(given_way, cost.over("ReduceMin", axis=1) - _FEASIBLE)
+    return graph.op("GatherND", candidates, best, batch_dims=1), moved, infeasible
+
+
+def _distance(graph: Graph, candidates: Tensor, start: Tensor, wish: Tensor | None) -> Tensor:
+    """Squared, up to a constant and a positive factor: |u - p|^2 + w (1 - |u|^2) with w = 1 - 1/|q|, for a
+    wish q whose projection on the disc is p."""
+    near = (candidates - start).over("ReduceSumSquare")
+    if wish is None:
+        return near
+    weight = 1.0 - 1.0 / graph.largest(wish.over("ReduceL2"), 1.0)
+    return near + weight * (1.0 - candidates.over("ReduceSumSquare"))
+
+
+def _on_lines(
+    graph: Graph, wish: Tensor, normals: Tensor, columns: Tensor, kept: Tensor, limits: Tensor
+) -> Tensor:
+    """On the line of each row, u = t T - c N, the point nearest to the wish that all allow: `(batch, count,
+    2)`.
+
+    Row j allows K t <= B there, with K = T_i.N_j and B = c_i N_i.N_j - c_j.
+    """
+    along = normals @ np.array([[0.0, -1.0], [1.0, 0.0]])
+    slope = along @ columns
+    # Where K is 0 this is no number, and not taken.
+    end = (kept * (normals @ columns) - limits + _ROUNDING) / slope
+    high = graph.where(slope > _ROUNDING, end, _VOID).over("ReduceMin")
+    low = graph.where(slope < -_ROUNDING, end, -_VOID).over("ReduceMax")
+    half = (1.0 - kept * kept).apply("Relu").apply("Sqrt")
+    t = graph.least(graph.largest((along * wish).over("ReduceSum"), low), high)
+    # The disc last: should the limits contradict each other, what is broken will show it.
+    t = graph.least(graph.largest(t, -half), half)
+    return along * t - normals * kept

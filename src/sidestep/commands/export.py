@@ -1,0 +1,94 @@
+"""`sidestep export`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from sidestep.commands.common import Overrides, parse_overrides, write_json_file
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a trained policy, the filter, or both as one file for a small computer: ONNX or jax.export."""
+
+    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, or a policy.npz, whose policy to export."""
+    out: Path
+    """File to write; never overwritten silently."""
+    format: str = "onnx"
+    """onnx, for onnxruntime alone, its filter that of the shield game; or jax: any shield, for jax alone."""
+    what: str = "policy+filter"
+    """policy+filter as one program, policy (observation to action) or filter (wished to safe velocity)."""
+    shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Shield: game for onnx (the look-ahead of joint does not fit a graph); for jax the run's own by
+    default."""
+    scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Preset or file; the run's own scenario, or paper, by default."""
+    set: Overrides = ()
+    """Scenario fields to change, such as evader_speed=0.18 capture_distance=0.15."""
+    position_error: float = 0.0
+    """Budget: largest error of a measured relative position, m."""
+    heading_error: float = 0.0
+    """Budget: largest error of a measured heading of a pursuer, rad."""
+    delay: float = 0.0
+    """Budget: time from a pose to the command decided on it, s; the own motion is taken to be predicted."""
+    tracking_error: float = 0.0
+    """Budget: how far the velocity driven is from the velocity told, m/s."""
+    overwrite: bool = False
+    """Replace --out where it exists."""
+    json: Path | None = None
+    """Also write what the file says about itself to this file."""
+
+
+def run(command: Export, console: Console) -> int:
+    """Run `sidestep export`; returns the exit status."""
+    from sidestep.learning import load_policy
+    from sidestep.learning.records import open_run
+    from sidestep.safety import Budget, GameShield, make_shield
+    from sidestep.world import load_scenario
+
+    if command.format not in ("onnx", "jax"):
+        raise ValueError(f"unknown format '{command.format}'; use onnx or jax")
+    if command.out.exists() and not command.overwrite:
+        raise ValueError(f"{command.out} exists already; give another file, or --overwrite to replace it")
+    policy = load_policy(command.run)
+    config = open_run(command.run) if Path(command.run).is_dir() else {}
+    overrides = parse_overrides(command.set)
+    if command.scenario is None and config:
+        scenario = load_scenario("paper", **{**config["scenario"], **overrides})
+    else:
+        scenario = load_scenario(command.scenario or "paper", **overrides)
+    name = command.shield or ("game" if command.format == "onnx" else config.get("shield", "joint"))
+    if command.format == "onnx" and name != "game":
+        raise ValueError(
+            f"an ONNX graph holds the rows of the shield 'game', not '{name}'; leave out --shield, or use "
+            "--format jax"
+        )
+    names = ("position_error", "heading_error", "delay", "tracking_error")
+    errors = {error: getattr(command, error) for error in names}
+    shield = make_shield(name, scenario, Budget(**errors) if any(errors.values()) else None)
+    about: dict[str, Any]
+    options = {"what": command.what, "run": command.run, "overwrite": command.overwrite}
+    if command.format == "onnx":
+        from sidestep.bridges.export import export_onnx
+
+        assert isinstance(shield, GameShield)
+        about = export_onnx(command.out, scenario, policy, shield=shield, **options)
+    else:
+        from sidestep.bridges.export import export_jax
+
+        about = export_jax(command.out, scenario, policy, shield=shield, shield_name=name, **options)
+    write_json_file(command.json, about)
+    size = command.out.stat().st_size
+    kept = "" if command.what == "policy" else f", shield {name}"
+    console.print(
+        f"{command.what}{kept} as {command.format}: {command.out}, {size / 1000:.0f} kB", highlight=False
+    )
+    return 0
