@@ -2,7 +2,7 @@
 
 from sidestep.bridges.twin.episode import TwinEpisode, run_twin, settings_for
 from sidestep.bridges.twin.library import TwinError
-from sidestep.bridges.twin.options import PURSUER_SEES, TwinOptions
+from sidestep.bridges.twin.options import PURSUER_SEES, TwinOptions, bounded_errors
 from sidestep.bridges.twin.robots import BASES
 from sidestep.bridges.twin.sensors import SENSORS, Measurement, Sensors, make_sensors
 from sidestep.bridges.twin.twin import Contacts, Twin
@@ -19,6 +19,7 @@ __all__ = [
     "TwinEpisode",
     "TwinError",
     "TwinOptions",
+    "bounded_errors",
     "frames_of",
     "make_sensors",
     "run_twin",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from sidestep.bridges.twin.library import TwinError
 from sidestep.bridges.twin.robots import BASES
 from sidestep.bridges.twin.sensors import SENSORS, Sensors
+from sidestep.world import Scenario
 
 PURSUER_SEES = ("truth", "measurements")
 """What the pursuer decides from: where everything truly is, or what the evader measures too."""
@@ -50,3 +51,15 @@ class TwinOptions:
             raise TwinError(
                 f"physics_step = {self.physics_step!r}: it must be at most 0.002 s, for stability"
             )
+
+
+def bounded_errors(scenario: Scenario, options: TwinOptions) -> dict[str, float]:
+    """The twin's errors as `sidestep.safety.certify` takes them.
+
+    The sensors' bounds, and in `delay` (s) also what passes until the motors obey: the actuation delay, the
+    servos' time constant, and half the time that a full reversal takes at the greatest acceleration.
+    """
+    bounds = options.sensors.bounds()
+    reversal = 2.0 * float(scenario.evader_speed) / options.acceleration
+    bounds["delay"] += options.actuation_delay + options.lag + reversal / 2.0
+    return bounds
