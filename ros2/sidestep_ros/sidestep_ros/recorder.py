@@ -52,7 +52,8 @@ class Recorder(Node):
     def latencies(self) -> np.ndarray:
         """Time (s) from the stamp of the newest pose used to the arrival of each command here."""
         found = []
-        for stamp, arrival in self.arrivals.items():
+        # A copy: while one counts here, more may arrive in another thread.
+        for stamp, arrival in self.arrivals.copy().items():
             if stamp in self.decisions:
                 age = float(values_of(self.decisions[stamp]).get(reports.NEWEST_POSE, math.nan))
                 found.append(age + (arrival - stamp) / NANOSECONDS)
@@ -63,18 +64,19 @@ class Recorder(Node):
 
         Only of commands between the first and the last decision heard of: reports follow their commands.
         """
-        first, last = min(self.decisions, default=0), max(self.decisions, default=0)
-        stamps = np.array([stamp for stamp in sorted(self.arrivals) if first <= stamp <= last], np.int64)
+        decided, arrived = sorted(self.decisions.copy()), sorted(self.arrivals.copy())
+        first, last = (decided[0], decided[-1]) if decided else (0, 0)
+        stamps = np.array([stamp for stamp in arrived if first <= stamp <= last], np.int64)
         return stamps[1:], np.diff(stamps) / NANOSECONDS
 
     def summary(self) -> dict[str, Any]:
         """Latencies (s), late commands by their stamps, and by how many the node's own count falls short."""
         latencies, (_, gaps) = self.latencies(), self.gaps()
-        told = [values_of(self.decisions[stamp]) for stamp in sorted(self.decisions)]
+        told = [values_of(status) for _, status in sorted(self.decisions.copy().items())]
         limit = float(told[0][reports.LATE_LIMIT]) if told else math.inf
         late = int(np.sum(gaps > limit + _ROUNDING))
         reported = int(told[-1][reports.LATE_COMMANDS]) - int(told[0][reports.LATE_COMMANDS]) if told else 0
-        arrivals = np.diff(np.array(sorted(self.arrivals.values()), np.int64)) / NANOSECONDS
+        arrivals = np.diff(np.array(sorted(self.arrivals.copy().values()), np.int64)) / NANOSECONDS
         return {
             "commands": len(self.arrivals),
             "with latency": len(latencies),
