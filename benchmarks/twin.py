@@ -79,7 +79,8 @@ def verdict(scenario: str, noise: float, delay: float) -> dict[str, Any]:
 def run_block(job: Job) -> dict[str, Any]:
     """A block of episodes: (scenario, base, noise, delay, block, episodes, settings) to its counts."""
     scenario, base, noise, delay, block, episodes, settings = job
-    from sidestep.bridges.twin import run_twin
+    from sidestep.bridges.onboard import Onboard
+    from sidestep.bridges.twin import settings_for, twin_episode
     from sidestep.safety.budget import BudgetWarning
 
     begun = time.perf_counter()
@@ -87,17 +88,10 @@ def run_block(job: Job) -> dict[str, Any]:
     figures = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BudgetWarning)
+        onboard = Onboard(chosen, settings["shield"], "goal-seeking", settings_for(options))
         for number in range(episodes):
             seed = settings["seed"] + block * episodes + number
-            episode = run_twin(
-                chosen,
-                "goal-seeking",
-                settings["shield"],
-                settings["pursuer"],
-                seed,
-                options,
-                settings["steps"],
-            )
+            episode = twin_episode(onboard, settings["pursuer"], seed, options, settings["steps"])
             figures.append(episode.to_dict())
     counts = {name: sum(one["outcome"] == name for one in figures) for name in _COUNTED}
     return {

@@ -1,9 +1,9 @@
 """The physics twin: do its robots move, slip and measure as they should, and is nothing missed in between?"""
 
+import dataclasses
 import math
 import sys
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,13 +19,14 @@ PERFECT = SENSORS["perfect"]
 STILL = np.zeros((1, 2))
 
 
-def start(scenario=SCENARIO) -> World:
-    return scenario.reset(jax.random.key(0))
+START = World(
+    np.zeros(2), np.array([[1.0, -0.5, 0.0]]), np.array([[1.5, 0.0, 0.02, 0.0]]), np.array([2.5, 0.0])
+)
 
 
 def make(scenario=SCENARIO, **options) -> Twin:
     twin = Twin(scenario, TwinOptions(**{"sensors": PERFECT, **options}))
-    twin.reset(start(scenario))
+    twin.reset(START)
     return twin
 
 
@@ -58,7 +59,7 @@ def test_motors_have_limits():
 @pytest.mark.parametrize("half_axle", [0.08, 0.2])
 @pytest.mark.parametrize("wheels", [(0.2, 0.2), (-0.2, 0.2), (0.05, 0.2), (-0.2, -0.1)])
 def test_pursuer_drives_the_arc_of_its_wheel_speeds(half_axle, wheels):
-    scenario = load_scenario("paper-test", pursuer_half_axle=half_axle, capture_distance=0.05)
+    scenario = dataclasses.replace(SCENARIO, pursuer_half_axle=half_axle)
     twin = make(scenario)
     speeds = np.array([wheels])
     twin.command(np.zeros(2), speeds)
@@ -95,14 +96,14 @@ def test_commands_beyond_the_limits_or_not_finite_never_reach_the_motors():
 
 
 def test_obstacles_drift_as_the_world_says():
-    scenario = load_scenario("paper", obstacle_count=3, obstacle_directions="random")
-    twin = make(scenario)
-    begin = np.asarray(start(scenario).obstacles)
+    twin = Twin(dataclasses.replace(SCENARIO, obstacle_count=3), TwinOptions(sensors=PERFECT))
+    begin = np.array([[1.0, 1.0, 0.02, 0.0], [-1.0, 1.0, 0.0, -0.05], [2.0, 0.0, -0.1, 0.1]])
+    twin.reset(World(np.zeros(2), np.array([[1.0, -0.5, 0.0]]), begin, np.ones(2)))
     twin.command(np.zeros(2), STILL)
     twin.advance(2.0)
-    np.testing.assert_allclose(
-        np.asarray(twin.world.obstacles)[:, :2], begin[:, :2] + 2.0 * begin[:, 2:], atol=1e-4
-    )
+    moved = np.asarray(twin.world.obstacles)
+    np.testing.assert_allclose(moved[:, :2], begin[:, :2] + 2.0 * begin[:, 2:], atol=1e-4)
+    np.testing.assert_allclose(moved[:, 2:], begin[:, 2:], atol=1e-4)
 
 
 def test_a_command_takes_effect_after_the_actuation_delay_and_not_before():
@@ -151,7 +152,7 @@ def test_reaching_counts_only_without_a_contact():
 def test_the_same_seed_measures_the_same_however_time_is_cut():
     def seen(seed, pieces):
         twin = Twin(SCENARIO, TwinOptions(sensors=make_sensors("odometry", {"dropout": 0.2})), seed)
-        twin.reset(start())
+        twin.reset(START)
         twin.command(np.array([0.1, 0.05]), np.array([[0.2, 0.1]]))
         collected = []
         for piece in pieces:
@@ -166,7 +167,7 @@ def test_the_same_seed_measures_the_same_however_time_is_cut():
         assert [one[:3] for one in again] == [one[:3] for one in whole]
         # The yaw loop hears of the heading only when someone reads the measurements.
         poses = [np.array([one.pose for one in those]) for those in (again, whole)]
-        np.testing.assert_allclose(poses[0], poses[1], atol=2e-3)
+        np.testing.assert_allclose(poses[0], poses[1], atol=6e-3)
     assert whole != seen(4, [0.6])
     assert {one.robot for one in whole} == {"evader", "pursuer", "obstacle"}
 
@@ -193,8 +194,8 @@ def test_bias_stays_and_drift_grows():
     off = biased - [1.0, 2.0, 3.0]
     np.testing.assert_allclose(np.linalg.norm(off[:, :2], axis=1), 0.01)
     assert np.ptp(off, axis=0).max() < 1e-12
-    walks = [watched(Sensors(rate=10.0, position_drift=0.01), 4.0, seed)[-1].pose[0] for seed in range(300)]
-    assert np.std(np.array(walks) - 1.0) == pytest.approx(0.01 * 2.0, rel=0.12)
+    walks = [watched(Sensors(rate=10.0, position_drift=0.01), 4.0, seed)[-1].pose[0] for seed in range(200)]
+    assert np.std(np.array(walks) - 1.0) == pytest.approx(0.01 * 2.0, rel=0.15)
 
 
 def test_measurements_arrive_late_and_with_the_stamp_at_which_they_were_true():
@@ -218,7 +219,7 @@ def test_dropped_samples_never_arrive():
 
 def test_sensors_have_seen_everybody_when_the_clock_starts():
     twin = Twin(SCENARIO, TwinOptions(sensors=make_sensors("odometry")), 1)
-    twin.reset(start())
+    twin.reset(START)
     first = twin.measurements()
     newest = {one.robot: one for one in first}
     assert set(newest) == {"evader", "pursuer", "obstacle"}

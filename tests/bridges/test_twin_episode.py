@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 
+from sidestep.bridges.onboard import Onboard
 from sidestep.bridges.twin import (
     SENSORS,
     Contacts,
@@ -15,6 +16,7 @@ from sidestep.bridges.twin import (
     library,
     run_twin,
     settings_for,
+    twin_episode,
     write_video,
 )
 from sidestep.bridges.twin.episode import _events
@@ -30,15 +32,24 @@ ROOMY = load_scenario("paper-test", capture_distance=0.15)
 
 
 @pytest.fixture(scope="module")
-def chased():
+def game():
+    return Onboard(ROOMY, "game", "goal-seeking", settings_for(TwinOptions()))
+
+
+@pytest.fixture(scope="module")
+def unshielded():
+    return Onboard(ROOMY, "none", "goal-seeking", settings_for(PERFECT))
+
+
+@pytest.fixture(scope="module")
+def chased(game):
     """An episode behind `game` with room to spare, on motion capture."""
-    return run_twin(ROOMY, "goal-seeking", "game", "nash", 1, TwinOptions(), steps=160)
+    return twin_episode(game, "nash", 1, TwinOptions(), 160)
 
 
-def test_without_noise_and_limits_the_twin_does_what_the_simulation_does():
+def test_without_noise_and_limits_the_twin_does_what_the_simulation_does(unshielded):
     quick = TwinOptions(sensors=SENSORS["perfect"], acceleration=200.0, lag=0.002, pursuer_lag=0.002)
-    settings = settings_for(quick)
-    twin = run_twin(ROOMY, "goal-seeking", "none", "nash", 0, quick, 60, settings=settings).trajectory
+    twin = twin_episode(unshielded, "nash", 0, quick, 60).trajectory
     plain = rollout(ROOMY, "goal-seeking", "none", "nash", 0, steps=60)
     assert twin.length == plain.length == 60
     for name, allowed in (("evader", 0.004), ("obstacles", 0.001), ("target", 0.0)):
@@ -49,10 +60,8 @@ def test_without_noise_and_limits_the_twin_does_what_the_simulation_does():
     assert np.abs(off).max() < 0.02
 
 
-def test_the_same_seed_gives_the_same_episode_and_another_does_not(chased):
-    again, other = (
-        run_twin(ROOMY, "goal-seeking", "game", "nash", seed, TwinOptions(), steps=40) for seed in (1, 2)
-    )
+def test_the_same_seed_gives_the_same_episode_and_another_does_not(game, chased):
+    again, other = (twin_episode(game, "nash", seed, TwinOptions(), 40) for seed in (1, 2))
     np.testing.assert_array_equal(again.trajectory.worlds.evader, chased.trajectory.worlds.evader[:41])
     np.testing.assert_array_equal(again.frames, chased.frames[: len(again.frames)])
     assert not np.array_equal(other.trajectory.action, again.trajectory.action)
@@ -73,6 +82,11 @@ def test_the_shield_keeps_its_distance_on_the_twin_where_there_is_room(chased):
     assert chased.least_pursuer_distance <= np.linalg.norm(apart, axis=1).min() + 1e-6
 
 
+def test_a_core_that_is_used_again_decides_as_a_new_one(chased):
+    fresh = run_twin(ROOMY, "goal-seeking", "game", "nash", 1, TwinOptions(), 20)
+    np.testing.assert_array_equal(fresh.trajectory.action, chased.trajectory.action[:20])
+
+
 def test_estimates_are_off_by_millimetres_and_motors_by_less_than_a_reversal(chased):
     assert 0.0005 < np.median(chased.estimate_errors) < 0.012
     assert np.max(chased.tracking_errors) < 2.0 * 0.1574
@@ -81,12 +95,12 @@ def test_estimates_are_off_by_millimetres_and_motors_by_less_than_a_reversal(cha
     assert chased.reactions == ()
 
 
-def test_without_a_shield_a_capture_is_counted_and_ends_the_episode():
+def test_without_a_shield_a_capture_is_counted_and_ends_the_episode(unshielded):
     # They drive at each other.
     facing = World(
         np.zeros(2), np.array([[1.0, 0.0, np.pi]]), np.array([[9.0, 9.0, 0.0, 0.0]]), np.array([2.5, 0.0])
     )
-    episode = run_twin(ROOMY, "goal-seeking", "none", "nash", 0, PERFECT, 200, world=facing)
+    episode = twin_episode(unshielded, "nash", 0, PERFECT, 200, world=facing)
     assert episode.outcome == "captured"
     assert 0.13 < episode.least_pursuer_distance <= 0.15
     assert episode.duration == pytest.approx(0.85 / 0.3574 + 0.05, abs=0.1)
@@ -94,17 +108,17 @@ def test_without_a_shield_a_capture_is_counted_and_ends_the_episode():
     assert not np.any(np.asarray(episode.trajectory.events.captured[:-1]))
 
 
-def test_with_nobody_in_its_way_the_evader_arrives():
+def test_with_nobody_in_its_way_the_evader_arrives(unshielded):
     far = World(
         np.zeros(2), np.array([[1.0, -9.0, 0.0]]), np.array([[9.0, 0.0, 0.0, 0.0]]), np.array([0.5, 0.0])
     )
-    episode = run_twin(ROOMY, "goal-seeking", "none", "nash", 0, PERFECT, world=far)
+    episode = twin_episode(unshielded, "nash", 0, PERFECT, world=far)
     assert episode.outcome == "reached"
     # 0.45 m at full speed, and some time to get there.
     assert episode.duration == pytest.approx(0.45 / 0.1574 + 0.08, abs=0.1)
-    assert run_twin(ROOMY, "goal-seeking", "none", "nash", 0, PERFECT, 10, world=far).outcome == "cut"
+    assert twin_episode(unshielded, "nash", 0, PERFECT, 10, world=far).outcome == "cut"
     with pytest.raises(ValueError, match="steps = 0"):
-        run_twin(ROOMY, "goal-seeking", "none", "nash", 0, PERFECT, 0)
+        twin_episode(unshielded, "nash", 0, PERFECT, 0)
 
 
 def test_time_runs_out_only_where_nothing_else_has_happened(chased):

@@ -70,11 +70,14 @@ class Twin:
 
 def run(command: Twin, console: Console) -> int:
     """Run `sidestep twin`; returns the exit status."""
+    import warnings
     from dataclasses import replace
 
-    from sidestep.bridges.twin import TwinOptions, make_sensors, run_twin, settings_for, write_video
+    from sidestep.bridges.onboard import Onboard
+    from sidestep.bridges.twin import TwinOptions, make_sensors, settings_for, twin_episode, write_video
     from sidestep.learning import load_policy
     from sidestep.safety import Budget
+    from sidestep.safety.budget import BudgetWarning
     from sidestep.world import load_scenario
 
     if command.seeds < 1:
@@ -97,16 +100,21 @@ def run(command: Twin, console: Console) -> int:
         settings = replace(settings, budget=budget)
     figures: list[dict[str, Any]] = []
     first = None
-    with CountBar(console, f"{command.shield} shield, {command.pursuer}, {command.base}") as show:
+    with (
+        warnings.catch_warnings(record=True) as warned,
+        CountBar(console, f"{command.shield} shield, {command.pursuer}, {command.base}") as show,
+    ):
+        warnings.simplefilter("always", BudgetWarning)
+        onboard = Onboard(scenario, command.shield, policy, settings)
+        onboard.warm_up()
         for number in range(command.seeds):
-            episode = run_twin(
-                scenario, policy, command.shield, command.pursuer, command.seed + number, options,
-                command.steps, settings=settings,
-            )  # fmt: skip
+            episode = twin_episode(onboard, command.pursuer, command.seed + number, options, command.steps)
             first = first or episode
             figures.append(episode.to_dict())
             show(number + 1, command.seeds)
     assert first is not None
+    for text in dict.fromkeys(str(one.message) for one in warned):
+        console.print(f"Warning: {text}.", highlight=False)
     _print(figures, console)
     write_json_file(command.json, _report(command, scenario, options, settings, figures))
     if command.out is not None:

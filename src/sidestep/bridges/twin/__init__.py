@@ -1,6 +1,6 @@
 """How would it go on robots? The scenario in a physics simulator: motors, wheels, noise and delay."""
 
-from sidestep.bridges.twin.episode import TwinEpisode, run_twin, settings_for
+from sidestep.bridges.twin.episode import TwinEpisode, run_twin, settings_for, twin_episode
 from sidestep.bridges.twin.library import TwinError
 from sidestep.bridges.twin.options import PURSUER_SEES, TwinOptions, bounded_errors
 from sidestep.bridges.twin.robots import BASES
@@ -24,5 +24,6 @@ __all__ = [
     "make_sensors",
     "run_twin",
     "settings_for",
+    "twin_episode",
     "write_video",
 ]

@@ -126,17 +126,37 @@ def run_twin(
     settings: OnboardSettings | None = None,
     world: World | None = None,
 ) -> TwinEpisode:
+    """One episode, as `twin_episode` with a decision core of its own; for many, compile one and use that.
+
+    **Arguments:** `policy` and `shield` as for `evaluate`; `settings` of the decision core, see
+    `settings_for`; the rest as for `twin_episode`.
+    """
+    options = options or TwinOptions()
+    onboard = Onboard(scenario, shield, policy, settings or settings_for(options))
+    return twin_episode(onboard, pursuer, seed, options, steps, world=world)
+
+
+def twin_episode(
+    onboard: Onboard,
+    pursuer: str | Callable[..., Any],
+    seed: int = 0,
+    options: TwinOptions | None = None,
+    steps: int | None = None,
+    *,
+    world: World | None = None,
+) -> TwinEpisode:
     """One episode: measurements, the decision core's command and the pursuers', physics, once per period.
 
     Start, measurements and random pursuers follow from `seed`; the start is that of `rollout` with this
     seed. Sensors have been on for half a second when the clock starts.
 
-    **Arguments:** `policy`, `shield` and `pursuer` as for `evaluate`; `steps` at most this many control
-    periods (the scenario's `episode_steps` if not given); `settings` of the decision core; `world` to start
+    **Arguments:** `onboard` the decision core, with a policy; it is reset. `pursuer` as for `evaluate`;
+    `steps` at most this many control periods (the scenario's `episode_steps` if not given); `world` to start
     in.
 
     **Raises** `ValueError` as `evaluate`, and `TwinError` when MuJoCo is missing.
     """
+    scenario = onboard.scenario
     limit = scenario.episode_steps if steps is None else operator.index(steps)
     if limit < 1:
         raise ValueError(f"steps = {steps!r}: it must be a whole number of at least 1")
@@ -144,8 +164,7 @@ def run_twin(
     twin = Twin(scenario, options, seed)
     drawn, key = _start(scenario, jnp.asarray(seed, jnp.uint32))
     twin.reset(drawn if world is None else world)
-    onboard = Onboard(scenario, shield, policy, settings or settings_for(twin.options))
-    onboard.warm_up()
+    onboard.reset()
     truth = twin.world
     onboard.target = (float(truth.target[0]), float(truth.target[1]))
     period = float(scenario.control_period)
