@@ -144,8 +144,11 @@ def assert_same_decisions(ours, theirs, aside, hard, speed):
     finite = ours.status != Status.INVALID
 
     def missed(velocity):
-        lack = ours.offsets - np.einsum("bnc,bc->bn", ours.normals, velocity)
-        return np.max(lack[:, :hard], axis=1), np.max(lack, axis=1, initial=-np.inf)
+        # A row that is no number is no row.
+        lack = np.nan_to_num(
+            ours.offsets - np.einsum("bnc,bc->bn", ours.normals, velocity), nan=-1.0, neginf=-1.0, posinf=-1.0
+        )
+        return np.max(lack[:, :hard], axis=1), np.max(lack, axis=1)
 
     (hard_ours, all_ours), (hard_theirs, all_theirs) = missed(ours.velocity), missed(theirs.velocity)
     assert np.max((hard_theirs - np.maximum(hard_ours, 0.0))[finite & same_sides]) <= LEVEL

@@ -38,6 +38,10 @@ class Evaluate:
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""
     json: Path | None = None
     """Also write the figures to this file."""
+    log: Path | None = None
+    """Also write one episode as an MCAP log of ROS 2 messages; never over a file that exists."""
+    log_episode: int = 0
+    """Which episode --log is to hold: the number of one of those measured."""
 
 
 def run(command: Evaluate, console: Console) -> int:
@@ -57,6 +61,13 @@ def run(command: Evaluate, console: Console) -> int:
         scenario = load_scenario("paper", **{**config["scenario"], **overrides})
     else:
         scenario = load_scenario(command.scenario or "paper", **overrides)
+    if not 0 <= command.log_episode < command.episodes:
+        raise ValueError(
+            f"log_episode = {command.log_episode}: it must be the number of an episode, 0 to "
+            f"{command.episodes - 1}"
+        )
+    if command.log is not None and command.log.exists():
+        raise ValueError(f"{command.log} exists already; give the log another name")
     shield = command.shield or config.get("shield", "joint")
     pursuer = command.pursuer or config.get("pursuer", "nash")
     with CountBar(console, f"{shield} shield, {pursuer}") as show:
@@ -67,7 +78,27 @@ def run(command: Evaluate, console: Console) -> int:
     console.print(evaluation_table(evaluation))
     about = {"policy": command.run, "shield": shield, "pursuer": pursuer, "scenario": scenario.name}
     write_json_file(command.json, {**evaluation.to_dict(), **about, "seed": command.seed})
+    if command.log is not None:
+        told = {**about, "seed": command.seed, "episode": command.log_episode, "source": "simulation"}
+        _write_log(command, scenario, policy, told, console)
     return 0
+
+
+def _write_log(
+    command: Evaluate, scenario: Any, policy: Any, about: dict[str, Any], console: Console
+) -> None:
+    """One of the episodes measured, run again and logged."""
+    from sidestep.bridges.logs import save_log
+    from sidestep.trials import episode_key, rollout
+
+    assert command.log is not None
+    key = episode_key(command.seed, command.log_episode)
+    trajectory = rollout(scenario, policy, about["shield"], about["pursuer"], key)
+    save_log(trajectory, scenario, command.log, about=about)
+    console.print(
+        f"Log of episode {command.log_episode} ({trajectory.outcome.replace('_', ' ')}): {command.log}",
+        highlight=False,
+    )
 
 
 def evaluation_table(evaluation: Evaluation) -> Any:

@@ -3,6 +3,7 @@
 from sidestep.views.capture_figure import capture_figure
 from sidestep.views.certificate_figure import certificate_figure
 from sidestep.views.comparison import Section, comparison_sections, markdown_tables
+from sidestep.views.episode_report import write_episode_report
 from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
@@ -27,5 +28,6 @@ __all__ = [
     "scenes_figure",
     "trajectory_figure",
     "twin_figure",
+    "write_episode_report",
     "write_report",
 ]

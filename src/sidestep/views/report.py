@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import importlib.metadata
 import platform
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from sidestep.pursuit import CaptureGame
 from sidestep.safety import Status
 from sidestep.trials import Capture, Trajectory, explain_capture
 from sidestep.views.capture_figure import capture_figure
+from sidestep.views.html import data_uri, shown_number, shown_value
 from sidestep.views.runs import Run, by_shield, load_run
 from sidestep.views.style import OUTCOME_WORDS, shield_colour, shield_words
 from sidestep.views.training_figures import (
@@ -112,7 +112,7 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "shield_words": shield_words,
         "colour": shield_colour,
         "percent": _percent,
-        "number": _number,
+        "number": shown_number,
         "paper_converged": PAPER_CONVERGED,
     }
 
@@ -130,12 +130,7 @@ def _first_of(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, tupl
 
 def _figure(written: tuple[Path, Path]) -> str:
     """A PNG as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(written[0].read_bytes()).decode()
-
-
-def _number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
-    """A number for readers; a dash for none."""
-    return "–" if value is None else f"{value:,.{digits}f}{unit}".replace("-", "−").replace(" ", "\u00a0")
+    return data_uri(written[0])
 
 
 def _percent(value: float | int | None, digits: int = 1) -> str:
@@ -195,7 +190,11 @@ def _comparison(
     finals = [
         np.mean([r for run in g for r in _pooled([run], "return")[-20:]] or [np.nan]) for g in groups.values()
     ]
-    add("mean return of the last 20", "1000", [_number(None if np.isnan(f) else float(f), 0) for f in finals])
+    add(
+        "mean return of the last 20",
+        "1000",
+        [shown_number(None if np.isnan(f) else float(f), 0) for f in finals],
+    )
     steps = [sum(_pooled(group, "steps")) for group in groups.values()]
     for key, name in (("interventions", "periods corrected"), ("infeasible", "periods infeasible")):
         shares = [
@@ -208,9 +207,9 @@ def _comparison(
         else None
         for group, periods in zip(groups.values(), steps, strict=True)
     ]
-    add("mean correction", "–", [_number(value, 4, " m/s") for value in corrections])
+    add("mean correction", "–", [shown_number(value, 4, " m/s") for value in corrections])
     closest = [min(_pooled(group, "min_pursuer_clearance"), default=None) for group in groups.values()]
-    add("closest to capture", "–", [_number(value, 4, " m") for value in closest])
+    add("closest to capture", "–", [shown_number(value, 4, " m") for value in closest])
     for policy, found, reported in (
         ("learned policy", scenes, "reached the target"),
         ("straight for the target", untrained_scenes, "–"),
@@ -227,7 +226,7 @@ def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> 
     corrected = float(np.mean(np.asarray(scene.status) != Status.OK)) if scene.length else 0.0
     facts = [
         f"The shield changed the velocity in {_percent(corrected)} of the control periods, on average over "
-        f"all of them by {_number(float(np.mean(np.asarray(scene.intervention))), 4, ' m/s')}."
+        f"all of them by {shown_number(float(np.mean(np.asarray(scene.intervention))), 4, ' m/s')}."
         if corrected
         else "The shield never changed the velocity."
     ]
@@ -235,7 +234,7 @@ def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> 
     for event, clearance in clearances:
         least = float(np.min(np.asarray(clearance)))
         if 0.0 < least < np.inf:
-            spare = _number(1000 * least, 1, " mm") if least < 0.05 else _number(least, 2, " m")
+            spare = shown_number(1000 * least, 1, " mm") if least < 0.05 else shown_number(least, 2, " m")
             facts.append(f"Closest to {event}: {spare} to spare.")
     return {
         "shield": shield,
@@ -289,18 +288,14 @@ def _game_numbers(scenario: Scenario) -> dict[str, Any]:
 
 
 def _configuration(run: Run) -> dict[str, Any]:
-    def shown(value: Any) -> str:
-        if value is None:
-            return "random"
-        return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-
     return {
         "name": f"{shield_words(run.shield)}, seed {run.seed}",
         "run": {
-            key: shown(run.config.get(key)) for key in ("shield", "pursuer", "seed", "episodes", "version")
+            key: shown_value(run.config.get(key))
+            for key in ("shield", "pursuer", "seed", "episodes", "version")
         }
-        | {"seconds of training": _number(run.summary.get("wall_seconds"), 0)}
-        | {"control periods simulated": _number(run.summary.get("env_steps"), 0)},
-        "scenario": {key: shown(value) for key, value in run.config["scenario"].items()},
-        "learner": {key: shown(value) for key, value in run.config.get("learner", {}).items()},
+        | {"seconds of training": shown_number(run.summary.get("wall_seconds"), 0)}
+        | {"control periods simulated": shown_number(run.summary.get("env_steps"), 0)},
+        "scenario": {key: shown_value(value) for key, value in run.config["scenario"].items()},
+        "learner": {key: shown_value(value) for key, value in run.config.get("learner", {}).items()},
     }

@@ -1,0 +1,222 @@
+"""Writing a log while something runs: simulation, twin, node or robot."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+import sidestep
+from sidestep._arrays import AnyArray
+from sidestep.bridges.logs import messages
+from sidestep.learning.records import json_safe
+from sidestep.safety import Status
+from sidestep.world import Scenario
+from sidestep.world.loading import scenario_to_dict
+
+METADATA = "sidestep"
+"""Name of the metadata record that says what was logged."""
+FRAME = "map"
+"""Frame of all poses and velocities unless told otherwise: the world's axes."""
+Numbers: TypeAlias = Sequence[float] | AnyArray
+"""A few numbers: a list, or an array of NumPy or JAX."""
+_CHUNK = 32_768
+_LEVELS = {Status.OK: 0, Status.CORRECTED: 0, Status.INFEASIBLE: 1, Status.INVALID: 2}
+
+
+def load(name: str) -> Any:
+    """The module `name`. **Raises** `ValueError` with the command to type when it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ValueError(
+            f"logs need the package '{name.partition('.')[0]}', which cannot be imported ({error}); "
+            "install it with: pip install 'sidestep[logs]'"
+        ) from error
+
+
+class LogWriter:
+    """An MCAP file of ROS 2 messages that is being written.
+
+    A context manager. Times are in s, of any clock that does not run backwards; positions m, velocities m/s,
+    in the axes of `frame`. What is written reaches the disk in chunks of 32 kB, a second or so of a robot's
+    life: a file cut off by a crash lacks no more than the last one, and `load_log` reads the rest.
+
+    **Arguments:** `scenario` and `about` (what else is to be known: shield, policy, pursuer, seed, source)
+    are stored at the very beginning.
+
+    **Raises** `ValueError` where `path` exists and `overwrite` is not set, or mcap is not installed.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        scenario: Scenario,
+        about: Mapping[str, Any] | None = None,
+        *,
+        frame: str = FRAME,
+        overwrite: bool = False,
+    ):
+        ros2 = load("mcap_ros2.writer")
+        self.path = Path(path)
+        if self.path.exists() and not overwrite:
+            raise ValueError(f"{self.path} exists already; give the log another name")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._frame = frame
+        self._file = open(self.path, "wb")  # noqa: SIM115
+        self._writer = ros2.Writer(self._file, chunk_size=_CHUNK)
+        self._schemas: dict[str, Any] = {}
+        self._counts: dict[str, int] = {}
+        record = {
+            "sidestep": sidestep.__version__,
+            "scenario": json.dumps(scenario_to_dict(scenario)),
+            "about": json.dumps(json_safe(about or {})),
+        }
+        self._writer.add_metadata(METADATA, record)
+        self._file.flush()
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write the index that lets readers jump, and close the file; once is enough."""
+        if not self._file.closed:
+            self._writer.finish()
+            self._file.close()
+
+    def write(self, topic: str, kind: str, stamp: float, message: Mapping[str, Any]) -> None:
+        """Any message of a kind that `messages` has a definition of."""
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_msgdef(kind, messages.definition(kind))
+        count = self._counts.get(topic, 0)
+        self._counts[topic] = count + 1
+        self._writer.write_message(
+            topic, self._schemas[kind], message, log_time=messages.nanoseconds(stamp), sequence=count
+        )
+        # A chunk that is complete is the operating system's business, whatever becomes of us.
+        self._file.flush()
+
+    def pose(
+        self,
+        robot: str,
+        stamp: float,
+        pose: Numbers,
+        index: int = 0,
+        velocity: Numbers | None = None,
+    ) -> None:
+        """Where a robot was: `robot` is `"evader"`, `"pursuer"` or `"obstacle"`, `pose` x, y and, if it has
+        one, a heading (rad); `velocity` of an obstacle, if known.
+
+        Topics `/evader/pose`, `/pursuer_0/pose`, `/obstacle_0/pose`, `/obstacle_0/velocity` and so on.
+        """
+        name = "evader" if robot == "evader" else f"{robot}_{index}"
+        x, y, heading = (*_plain(pose), 0.0)[:3]
+        self.write(f"/{name}/pose", messages.POSE, stamp, messages.pose(stamp, x, y, heading, self._frame))
+        if velocity is not None:
+            self._twist(f"/{name}/velocity", stamp, velocity)
+
+    def target(self, stamp: float, target: Numbers) -> None:
+        """Where the evader is to go. Topic `/target`."""
+        x, y = _plain(target)
+        message = messages.pose(stamp, x, y, 0.0, self._frame)
+        self.write("/target", messages.POSE, stamp, message)
+
+    def wheels(self, stamp: float, speeds: Numbers, index: int = 0) -> None:
+        """Rim speeds (left, right; m/s) that a pursuer was told. Topic `/pursuer_0/wheel_speeds` and so
+        on."""
+        message = messages.numbers(("left", "right"), _plain(speeds))
+        self.write(f"/pursuer_{index}/wheel_speeds", messages.NUMBERS, stamp, message)
+
+    def driven(self, stamp: float, speeds: Numbers, index: int = 0) -> None:
+        """Rim speeds (left, right; m/s) that a pursuer drove until now. Topic `/pursuer_0/driven` and so
+        on."""
+        self.write(
+            f"/pursuer_{index}/driven",
+            messages.NUMBERS,
+            stamp,
+            messages.numbers(("left", "right"), _plain(speeds)),
+        )
+
+    def decision(
+        self,
+        stamp: float,
+        *,
+        nominal: Numbers,
+        velocity: Numbers,
+        status: int,
+        slack: float,
+        intervention: float,
+        barriers: Numbers,
+        level: str = "normal",
+        reactions: Sequence[str] = (),
+        **more: float,
+    ) -> None:
+        """What the shield was asked and answered; `more` is any other number to keep, such as `latency`.
+
+        Topics `/cmd_vel_nominal`, `/cmd_vel`, `/diagnostics` and `/shield`, which has the numbers: status,
+        slack, intervention, whatever `more` holds, and the barriers h0, h1, ... (m; pursuers first).
+        """
+        self._twist("/cmd_vel_nominal", stamp, nominal)
+        self._twist("/cmd_vel", stamp, velocity)
+        told = {"slack": slack, "intervention": intervention, **more}
+        bars = {f"h{index}": value for index, value in enumerate(_plain(barriers))}
+        values = {"status": float(status), **told, **bars}
+        self.write("/shield", messages.NUMBERS, stamp, messages.numbers(list(values), list(values.values())))
+        word = Status.NAMES[int(status)]
+        severity = max(_LEVELS[int(status)], 0 if level == "normal" else 1)
+        message = "; ".join([f"{word}, {level}", *reactions])
+        listed = [("status", word), ("level", level), *((key, f"{value:.6g}") for key, value in told.items())]
+        self.write(
+            "/diagnostics",
+            messages.DIAGNOSTICS,
+            stamp,
+            messages.diagnostics(stamp, severity, message, listed),
+        )
+
+    def events(self, stamp: float, events: Mapping[str, float]) -> None:
+        """What a simulation says of the period that begins at `stamp`: the fields of `Events`. Topic
+        `/events`."""
+        self.write("/events", messages.NUMBERS, stamp, messages.numbers(list(events), list(events.values())))
+
+    def world(self, stamp: float, world: Any) -> None:
+        """All poses, and the target, of a `World`."""
+        self.pose("evader", stamp, world.evader)
+        for index, pose in enumerate(np.asarray(world.pursuers).tolist()):
+            self.pose("pursuer", stamp, pose, index)
+        for index, (x, y, vx, vy) in enumerate(np.asarray(world.obstacles).tolist()):
+            self.pose("obstacle", stamp, (x, y), index, (vx, vy))
+        self.target(stamp, world.target)
+
+    def onboard(self, stamp: float, decision: Any) -> None:
+        """A `Decision` of `sidestep.bridges.onboard`, with the world that it was made from, if there was
+        one."""
+        if decision.world is not None:
+            self.world(stamp, decision.world)
+        self.decision(
+            stamp,
+            nominal=decision.nominal,
+            velocity=decision.velocity,
+            status=int(decision.status),
+            slack=float(decision.slack),
+            intervention=float(decision.intervention),
+            barriers=decision.barriers,
+            level=decision.level,
+            reactions=decision.reactions,
+            clearance=float(decision.clearance),
+            latency=float(decision.latency),
+        )
+
+    def _twist(self, topic: str, stamp: float, velocity: Numbers) -> None:
+        vx, vy = _plain(velocity)
+        self.write(topic, messages.TWIST, stamp, messages.twist(stamp, vx, vy, self._frame))
+
+
+def _plain(values: Numbers) -> list[float]:
+    return np.asarray(values, float).tolist()
