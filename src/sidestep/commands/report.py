@@ -42,9 +42,9 @@ def _report_log(command: Report, console: Console) -> int:
     from sidestep.bridges.logs import load_log
     from sidestep.views import write_episode_report
 
-    if len(command.runs) > 1:
+    path, *others = command.runs
+    if others:
         raise ValueError("a report is of runs or of one log")
-    path = command.runs[0]
     log = load_log(path)
     out = command.out or path.with_suffix(".html")
     written = write_episode_report(
