@@ -197,6 +197,12 @@ def test_random_garbage_never_raises_and_never_lets_a_command_out_of_the_limits(
         assert decision.level in ("normal", "degraded", "evade", "stop")
 
 
+def test_a_policy_holds_still_once_it_has_arrived():
+    there = Onboard(SCENARIO, "none", "goal-seeking")
+    there.target = (0.03, 0.0)
+    assert not np.any(run(there, 2, without=("nominal",)).velocity)
+
+
 def test_a_core_that_keeps_falling_behind_goes_without_looking_ahead_until_it_keeps_pace():
     # One model of the pursuer: what is compiled is smaller.
     shield = JointShield(SCENARIO, budget=Budget(), models=("nash",))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sidestep._arrays import real
+from sidestep._arrays import length, real
 from sidestep.learning.control_step import decide
 from sidestep.pursuit import make_pursuer, pursue
 from sidestep.safety import JointShield, PursuitBarrier, Shield
@@ -131,6 +131,9 @@ def _answer(
     nominal = wished
     if policy is not None:
         nominal = jnp.where(ask > 0.0, decide(scenario, policy, world), wished)
+        # Policies are made for the way there, and an episode ends at the target: a robot stays.
+        way = world.target - world.evader
+        nominal = jnp.where(length(way[0], way[1]) <= scenario.reach_distance, 0.0, nominal)
     if scenario.pursuer_count:
         barrier = PursuitBarrier()
         rows = barrier.rows(scenario, world, barrier.remember(scenario, world))

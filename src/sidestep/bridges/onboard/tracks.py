@@ -15,8 +15,6 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-_HISTORY = 5.0
-"""Commands are remembered for so long (s)."""
 _REACTION = 0.25
 """Within about this time (s) a pursuer's wheels go from rest to full speed, as far as its filter knows."""
 
@@ -62,7 +60,8 @@ class EvaderTrack(Track):
     def told(self, time: float, velocity: Float[np.ndarray, "2"]) -> None:
         """A command (m/s, world axes) was given at `time` (s)."""
         self._commands.append((time + self._lag, np.array(velocity, float)))
-        while len(self._commands) > 2 and self._commands[1][0] < time - _HISTORY:
+        # What acted before the last pose is in it.
+        while len(self._commands) > 1 and self._commands[1][0] <= (self.stamp or -math.inf):
             self._commands.popleft()
 
     def _travelled(self, begin: float, end: float) -> Float[np.ndarray, "2"]:
