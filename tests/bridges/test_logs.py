@@ -252,15 +252,16 @@ def test_evaluate_logs_the_episode_that_was_asked_for(tmp_path, capsys):
     from sidestep.trials import episode_key, rollout
 
     path = tmp_path / "one.mcap"
-    command = ["evaluate", "goal-seeking", "--shield", "none", "--episodes", "3", "--batch", "3", "--set"]
+    command = ["evaluate", "goal-seeking", "--shield", "none", "--pursuer", "still"]
+    command += ["--episodes", "3", "--batch", "3", "--set"]
     command += ["episode_steps=40", "--log", str(path), "--log-episode", "2"]
     assert main(command) == 0
     scenario = load_scenario("paper", episode_steps=40)
-    expected = rollout(scenario, "goal-seeking", "none", "nash", episode_key(0, 2))
+    expected = rollout(scenario, "goal-seeking", "none", "still", episode_key(0, 2))
     read = load_log(path).trajectory
     np.testing.assert_array_equal(read.worlds.evader, expected.worlds.evader)
     assert read.outcome == expected.outcome
     assert main(command) == 2
     assert "exists already" in capsys.readouterr().err
-    assert main([*command[:-3], "--log", str(tmp_path / "x.mcap"), "--log-episode", "3"]) == 2
+    assert main([*command[:-4], "--log", str(tmp_path / "x.mcap"), "--log-episode", "3"]) == 2
     assert "0 to 2" in capsys.readouterr().err
