@@ -270,7 +270,7 @@ class GameShield(Shield):
         else:
             memory = barrier.remember(kept, world, memory)
         if self.budget is not None:
-            barrier = PursuitBarrier(eased=margins(self.scenario, self.budget)[0])
+            # Errors push inwards again and again: from within the budget's margin the row leads back out.
             kept = guarded(self.scenario, self.budget)
         rows = _with_obstacles(barrier, kept, world, memory)
         if self.budget is None:

@@ -16,7 +16,7 @@ from sidestep.bridges.export.scene import Scene, for_each, picks
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import Budget, GameShield
 from sidestep.safety.barriers import KEEP_SIDE, LOST_SIDE, STEEPER
-from sidestep.safety.sampling_margin import guarded, margins
+from sidestep.safety.sampling_margin import guarded, sampling_margin
 
 _SMALLEST = 1e-30
 
@@ -85,7 +85,7 @@ def _constants(shield: GameShield, budget: Budget | None) -> Constants:
         gain=gain / speed,
         steep=max(gain, STEEPER * turning) / speed,
         spare=max(float(game.largest_capture_distance - game.capture_distance), 0.0),
-        eased=float(margins(scenario, budget)[0]),
+        eased=float(sampling_margin(scenario)),
         obstacle_gain=float(scenario.obstacle_gain) / speed,
         tracking_error=0.0 if budget is None else float(budget.tracking_error) / speed,
     )
