@@ -14,7 +14,7 @@ from sidestep.bridges.export.graph import Graph, Tensor
 from sidestep.bridges.export.levels_graph import Row
 from sidestep.bridges.export.scene import Scene, for_each, picks
 from sidestep.pursuit import CaptureGame
-from sidestep.safety import Budget, GameShield
+from sidestep.safety import GameShield
 from sidestep.safety.barriers import KEEP_SIDE, LOST_SIDE, STEEPER
 from sidestep.safety.sampling_margin import guarded, sampling_margin
 
@@ -45,7 +45,7 @@ class Constants:
 
 def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
     """Those of a `game` shield: of its rows, at the distances that it keeps, and of the choice of sides,
-    which knows of the budget only that it leaves a doubt on which side the evader is.
+    for which the budget also leaves a doubt on which side the evader is.
 
     **Raises** `ValueError` for what a graph cannot hold: a scenario of fixed speed, a pursuer gain of 0, a
     shield that is told the pursuers' velocities or lets the wish pick the side.
@@ -60,15 +60,16 @@ def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
         raise ValueError("scenario field 'pursuer_gain' = 0: an ONNX filter needs one greater than 0")
     if shield.known_velocity or shield.wish_picks_side:
         raise ValueError("an ONNX filter has the rows of make_shield('game', scenario); this shield's differ")
-    sides = _constants(shield, None)
+    kept = _constants(shield)
     if budget is None:
-        return sides, sides
+        return kept, kept
     doubts = float(budget.position_error), float(budget.heading_error)
-    return _constants(shield, budget), replace(sides, position_doubt=doubts[0], heading_doubt=doubts[1])
+    return kept, replace(kept, position_doubt=doubts[0], heading_doubt=doubts[1])
 
 
-def _constants(shield: GameShield, budget: Budget | None) -> Constants:
-    scenario, kept = shield.scenario, guarded(shield.scenario, budget)
+def _constants(shield: GameShield) -> Constants:
+    scenario, budget = shield.scenario, shield.budget
+    kept = guarded(scenario, budget)
     game, speed = CaptureGame.of(kept), float(scenario.evader_speed)
     usable = game.usable_angle
     gain = float(scenario.pursuer_gain)
