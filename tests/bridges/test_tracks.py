@@ -71,12 +71,11 @@ def test_the_own_motion_since_a_late_pose_is_added_from_the_commands_when_they_a
 
 def test_averaging_poses_of_a_moving_robot_does_not_hold_it_back():
     rng, track = np.random.default_rng(2), EvaderTrack(NOISE, TURN, 0.003, lag=0.0)
-    off = []
+    off, truth = [], np.zeros(2)
     for i in range(400):
         if i % 5 == 0:
             command = 0.15 * np.array([np.cos(0.05 * i), np.sin(0.05 * i)])
             track.told(RATE * i, command)
-            truth = np.zeros(2) if i == 0 else truth
         seen = np.array([*(truth + rng.normal(scale=NOISE, size=2)), 0.0])
         (track.start if i == 0 else track.take)(RATE * i, seen)
         off.append(track.at(RATE * i)[:2] - truth)

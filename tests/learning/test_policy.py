@@ -85,6 +85,7 @@ def read_events(folder):
     return scalars
 
 
+@pytest.mark.slow
 def test_curves_hold_each_episode_once_even_after_a_resume(small, tmp_path, monkeypatch):
     calls = []
 

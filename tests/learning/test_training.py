@@ -93,6 +93,7 @@ def test_chunk_returns_exactly_the_types_it_takes(small):
         assert getattr(before, "weak_type", False) == getattr(now, "weak_type", False)
 
 
+@pytest.mark.slow
 def test_seeds_and_learning_rates_under_vmap_train_as_they_do_alone(small, x64):
     """In float64, where rounding (the one difference there may be) stays far below the tolerance of 1e-8."""
     scenario, options = small.scenario(), small.options()
@@ -216,6 +217,7 @@ def test_executed_actions_are_learned_from_through_the_shield_of_their_own_world
         assert np.max(np.abs(slope(other) - slope(expected[1]))) > 0.05 * largest
 
 
+@pytest.mark.slow
 def test_each_choice_of_replay_action_trains_and_gives_another_policy(small):
     # A pursuer fast enough that the shield has to correct much.
     scenario = small.scenario(pursuer_speed=1.0)

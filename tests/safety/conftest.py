@@ -9,11 +9,20 @@ import pytest
 LIMIT = 0.1574
 
 
+# What `joint` does in these, the rows of `game` inside it do.
+_SHARED = (
+    "test_in_heading_mode_the_robot_never_slows_down",
+    "test_barriers_are_listed_pursuers_first",
+)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """`joint` takes long to compile: in float64 it is tested by name."""
+    """What takes long to compile is tested by name: `joint` in float64, and what is not about it."""
     for item in items:
         parameters = getattr(getattr(item, "callspec", None), "params", {})
         if parameters.get("name") == "joint" and parameters.get("precision"):
+            item.add_marker(pytest.mark.slow)
+        if parameters.get("name") == "joint" and getattr(item, "originalname", "") in _SHARED:
             item.add_marker(pytest.mark.slow)
 
 

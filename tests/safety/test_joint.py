@@ -170,6 +170,7 @@ def test_whatever_is_driven_has_passed_the_pursuers_row(decided):
     assert np.mean(np.asarray(memory.way) != WISHES - 1) > 0.2
 
 
+@pytest.mark.slow
 def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_while():
     """In a chase by a pursuer that never lets go; the memory before and after every period is looked at."""
     scenario = load_scenario("paper", obstacle_starts=[[0.35, 0.45]], obstacle_velocity=[0.0, 0.0])

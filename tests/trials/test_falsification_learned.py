@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from sidestep.learning.checkpoints import read_named
 from sidestep.learning.control_step import RUNNING
@@ -55,6 +56,7 @@ def test_pursuer_sees_the_same_in_a_turned_world():
     assert np.max(np.abs(seen)) <= 1.0 + 1e-6
 
 
+@pytest.mark.slow
 def test_resumed_learner_has_learned_the_same(tmp_path):
     plan = Plan(attacks=("learned",), goal="capture", batch=8, seconds=0.4)
 
