@@ -21,15 +21,12 @@ it stopped, and one that is asked for more blocks adds them. It uses an accelera
 import argparse
 import importlib.metadata
 import json
-import multiprocessing
-import os
-import platform
-import signal
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import study_blocks
 
 STOP_SHORT = 0.02
 """Distance (m) from the target at which `stay` holds still."""
@@ -206,30 +203,12 @@ def _write(path: Path, settings: dict[str, Any], blocks: list[dict[str, Any]]) -
     report = {
         "what": f"episodes behind the {settings['shield']} shield: captures and collisions",
         "settings": settings,
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count(),
-                    "device": jax.devices()[0].device_kind},
+        "machine": study_blocks.machine() | {"device": jax.devices()[0].device_kind},
         "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "jax", "numpy")},
         **summary(blocks),
         "blocks": sorted(blocks, key=lambda b: (b["pursuer"], b["policy"], b["block"])),
     }  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".tmp")
-    beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    os.replace(beside, path)
-
-
-def _alone() -> None:
-    """A worker leaves Ctrl-C to its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _results(jobs: list[Any], processes: int) -> Iterator[dict[str, Any]]:
-    if processes == 1:
-        yield from map(run_block, jobs)
-        return
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    with multiprocessing.get_context("spawn").Pool(processes, _alone) as pool:
-        yield from pool.imap_unordered(run_block, jobs)
+    study_blocks.write(path, report)
 
 
 def main() -> None:
@@ -261,12 +240,7 @@ def main() -> None:
         "study": arguments.study, "scenario": "paper", "fields": fields, "shield": study.shield,
         "seed": arguments.seed, "episodes_per_block": size,
     }  # fmt: skip
-    blocks: list[dict[str, Any]] = []
-    if arguments.out.exists():
-        earlier = json.loads(arguments.out.read_text(encoding="utf-8"))
-        if earlier["settings"] != settings:
-            raise SystemExit(f"{arguments.out} was made with other settings, {earlier['settings']}")
-        blocks = earlier["blocks"]
+    blocks: list[dict[str, Any]] = study_blocks.earlier(arguments.out, settings).get("blocks", [])
     done = {(b["pursuer"], b["policy"], b["block"]) for b in blocks}
     wanted = {
         pursuer: study.blocks.get(pursuer, study.other) if arguments.blocks is None else arguments.blocks
@@ -282,7 +256,7 @@ def main() -> None:
     print(f"{len(done)} blocks are done, {len(jobs)} to do, {size} episodes each", flush=True)
     begun = time.perf_counter()
     try:
-        for count, result in enumerate(_results(jobs, arguments.processes), 1):
+        for count, result in enumerate(study_blocks.results(run_block, jobs, arguments.processes), 1):
             blocks.append(result)
             _write(arguments.out, settings, blocks)
             left = (time.perf_counter() - begun) / count * (len(jobs) - count)

@@ -18,17 +18,13 @@ it stopped, and one that is asked for more blocks adds them.
 
 import argparse
 import importlib.metadata
-import json
 import math
-import multiprocessing
-import os
-import platform
-import signal
 import time
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import study_blocks
 
 SCENARIOS = {"paper": {}, "roomy": {"capture_distance": 0.15}}
 NOISES = (0.0, 0.002, 0.005, 0.01, 0.02)
@@ -142,30 +138,13 @@ def _write(path: Path, settings: dict[str, Any], blocks: list[Any], verdicts: li
     report = {
         "what": "episodes on the physics twin over noise and delay, beside the certificate's verdict",
         "settings": settings,
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
+        "machine": study_blocks.machine(),
         "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "mujoco", "jax")},
         "cells": summary(blocks, verdicts),
         "verdicts": verdicts,
         "blocks": sorted(blocks, key=lambda block: (*_cell(block), block["block"])),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".tmp")
-    beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    os.replace(beside, path)
-
-
-def _alone() -> None:
-    """A worker leaves Ctrl-C to its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _results(jobs: list[Job], processes: int) -> Iterator[dict[str, Any]]:
-    if processes == 1:
-        yield from map(run_block, jobs)
-        return
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    with multiprocessing.get_context("spawn").Pool(processes, _alone) as pool:
-        yield from pool.imap_unordered(run_block, jobs)
+    study_blocks.write(path, report)
 
 
 def main() -> None:
@@ -190,13 +169,9 @@ def main() -> None:
         "shield": arguments.shield, "pursuer": arguments.pursuer, "policy": "goal-seeking",
         "seed": arguments.seed, "episodes_per_block": arguments.block, "steps": arguments.steps,
     }  # fmt: skip
-    blocks: list[dict[str, Any]] = []
-    verdicts: list[dict[str, Any]] = []
-    if arguments.out.exists():
-        earlier = json.loads(arguments.out.read_text(encoding="utf-8"))
-        if earlier["settings"] != settings:
-            raise SystemExit(f"{arguments.out} was made with other settings, {earlier['settings']}")
-        blocks, verdicts = earlier["blocks"], earlier["verdicts"]
+    earlier = study_blocks.earlier(arguments.out, settings)
+    blocks: list[dict[str, Any]] = earlier.get("blocks", [])
+    verdicts: list[dict[str, Any]] = earlier.get("verdicts", [])
     done = {(*_cell(block), block["block"]) for block in blocks}
     judged = {(one["scenario"], one["noise"], one["delay"]) for one in verdicts}
     # Block by block over all cells: an interrupted run has the whole table, of fewer episodes.
@@ -216,7 +191,7 @@ def main() -> None:
                 judged.add((scenario, noise, delay))
                 verdicts.append(verdict(scenario, noise, delay))
         begun = time.perf_counter()
-        for count, result in enumerate(_results(jobs, arguments.processes), 1):
+        for count, result in enumerate(study_blocks.results(run_block, jobs, arguments.processes), 1):
             blocks.append(result)
             _write(arguments.out, settings, blocks, verdicts)
             left = (time.perf_counter() - begun) / count * (len(jobs) - count)

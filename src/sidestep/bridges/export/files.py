@@ -1,8 +1,7 @@
-"""What an export writes, and what it needs installed to do so."""
+"""What an export writes."""
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,17 +14,6 @@ from sidestep.world.loading import scenario_to_dict
 
 UNITS = "positions m, velocities m/s, headings rad counter-clockwise; world axes, x forward, y left"
 STATUS_WORDS = "0 ok, 1 corrected, 2 infeasible, 3 invalid"
-
-
-def load(name: str) -> Any:
-    """The module `name`. **Raises** `ValueError` with the command to type when it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(
-            f"exporting needs the package '{name.partition('.')[0]}', which cannot be imported ({error}); "
-            "install it with: pip install 'sidestep[export]'"
-        ) from error
 
 
 def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sidestep.bridges.export.files import load
+from sidestep.bridges.packages import needed
 
 OPSET = 17
 """Known to onnxruntime from 1.12 on."""
@@ -97,7 +97,7 @@ class Graph:
     """An ONNX graph under construction; equal constants are stored once, and names follow from the order."""
 
     def __init__(self) -> None:
-        self._onnx = load("onnx")
+        self._onnx = needed("onnx", "export", "exporting needs")
         self._nodes: list[Any] = []
         self._constants: dict[tuple[str, tuple[int, ...], bytes], tuple[str, np.ndarray]] = {}
         self._inputs: list[Any] = []

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jax import export
 
 from sidestep._arrays import real
-from sidestep.bridges.export.files import facts, load, write_new
+from sidestep.bridges.export.files import facts, write_new
+from sidestep.bridges.packages import needed
 from sidestep.learning.control_step import decide
 from sidestep.safety import Shield
 from sidestep.world import Scenario, World, observation_size
@@ -50,7 +51,7 @@ def export_jax(
     """
     from sidestep.bridges.export.onnx_export import WHAT
 
-    load("flatbuffers")
+    needed("flatbuffers", "export", "exporting needs")
     if what not in WHAT:
         raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
     if policy is None and what != "filter":

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sidestep.bridges.logs.writer import METADATA, load
+from sidestep.bridges.logs.writer import METADATA
+from sidestep.bridges.packages import needed
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def read_log(path: str | Path) -> Record:
     **Raises** `ValueError` for a file that is none, or without anything in it; or where mcap is not
     installed.
     """
-    load("mcap_ros2.decoder")
+    needed("mcap_ros2.decoder", "logs", "logs need")
     from mcap.exceptions import McapError
     from mcap.records import Channel, DataEnd, Message, Metadata, Schema
     from mcap.stream_reader import StreamReader

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import sidestep
 from sidestep._arrays import AnyArray
 from sidestep.bridges.logs import messages
+from sidestep.bridges.packages import needed
 from sidestep.learning.records import json_safe
 from sidestep.safety import Status
 from sidestep.world import Scenario
@@ -26,17 +26,6 @@ Numbers: TypeAlias = Sequence[float] | AnyArray
 """A few numbers: a list, or an array of NumPy or JAX."""
 _CHUNK = 32_768
 _LEVELS = {Status.OK: 0, Status.CORRECTED: 0, Status.INFEASIBLE: 1, Status.INVALID: 2}
-
-
-def load(name: str) -> Any:
-    """The module `name`. **Raises** `ValueError` with the command to type when it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(
-            f"logs need the package '{name.partition('.')[0]}', which cannot be imported ({error}); "
-            "install it with: pip install 'sidestep[logs]'"
-        ) from error
 
 
 class LogWriter:
@@ -61,7 +50,7 @@ class LogWriter:
         frame: str = FRAME,
         overwrite: bool = False,
     ):
-        ros2 = load("mcap_ros2.writer")
+        ros2 = needed("mcap_ros2.writer", "logs", "logs need")
         self.path = Path(path)
         if self.path.exists() and not overwrite:
             raise ValueError(f"{self.path} exists already; give the log another name")

@@ -79,7 +79,7 @@ class Answering:
     """
 
     def __init__(self, shield: Shield, policy: Callable[..., Any] | None):
-        self.shield, scenario = shield, shield.scenario
+        scenario = shield.scenario
         self._arrays, fixed = eqx.partition((shield, policy), eqx.is_array)
         m, k = scenario.pursuer_count, scenario.obstacle_count
         self._shapes: list[tuple[int, ...]] = [(2,), (m, 3), (k, 4), (2,), (m, 2), (), (2,), (), (), ()]

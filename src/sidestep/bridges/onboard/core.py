@@ -106,7 +106,6 @@ class Onboard:
         self._wish: tuple[float, Numbers] | None = None
         self._held = np.full(2, np.nan)
         self._now: float | None = None
-        self._begun: float | None = None
         self._late_in_a_row, self._on_time, self._lateness, self._behind = 0, 0, 0.0, False
         self._decided = 0
         self._memory: Any = None

@@ -1,0 +1,48 @@
+"""A study in blocks of episodes: worked on by processes, written down block by block."""
+
+import json
+import multiprocessing
+import os
+import platform
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+
+def results(run_block: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterator[Any]:
+    """`run_block` of every job, as they are done: here with one process, else in as many of one core each."""
+    if processes == 1:
+        yield from map(run_block, jobs)
+        return
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    with multiprocessing.get_context("spawn").Pool(processes, _alone) as pool:
+        yield from pool.imap_unordered(run_block, jobs)
+
+
+def _alone() -> None:
+    """A worker leaves Ctrl-C to its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def write(path: Path, report: dict[str, Any]) -> None:
+    """Replaces the report as a whole, so that an interrupted study leaves the one before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".tmp")
+    beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """The report to go on with; empty if there is none. Ends the program if its settings were others."""
+    if not path.exists():
+        return {}
+    report = json.loads(path.read_text(encoding="utf-8"))
+    if report["settings"] != settings:
+        raise SystemExit(f"{path} was made with other settings, {report['settings']}")
+    return report
+
+
+def machine() -> dict[str, Any]:
+    """Where a study ran."""
+    return {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
