@@ -2,7 +2,7 @@
 // that keeps everything in view.
 
 const SECONDS = 1.3; // an arrow is as long as the way in this time
-const ROW_SECONDS = 2.4; // the same for the half-planes
+const ROW_SECONDS = 2; // the same for the half-planes
 const EVADER = 0.065; // m, radius of the drawn robot; its size does not enter the problem
 const TRAIL = 14; // s
 
@@ -442,7 +442,10 @@ export class Scene {
     const { nominal, action } = frame;
     const apart = Math.hypot(nominal[0] - action[0], nominal[1] - action[1]) > 0.004;
     if (apart) this.arrow(at, nominal[0], nominal[1], SECONDS, colours.wish, 2, [3, 4], false);
-    this.arrow(at, action[0], action[1], SECONDS, colours.evaderText, 3);
+    const speed = Math.hypot(...action);
+    if (speed < 1e-3) return;
+    const out = Math.max(EVADER * this.camera.scale, 8) / speed;
+    this.arrow([at[0] + out * action[0], at[1] - out * action[1]], action[0], action[1], SECONDS, colours.evaderText, 3);
   }
 
   // Half-planes n.u >= c of the velocity: what a row forbids is hatched, in a disc as large as the speed limit.
@@ -602,8 +605,7 @@ export class Scene {
   ruler(view, colours) {
     const { pen, camera } = this;
     const long = camera.scale > 260 ? 0.25 : 0.5;
-    const x = view.free.left + view.free.width - long * camera.scale - 4;
-    const y = view.free.top + view.free.height - 4;
+    const [x, y] = view.ruler;
     pen.strokeStyle = pen.fillStyle = colours.soft;
     pen.lineWidth = 1.5;
     pen.beginPath();
