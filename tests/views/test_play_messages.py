@@ -19,7 +19,7 @@ def read(**message):
 
 
 @pytest.mark.parametrize(
-    ("message", "expected"),
+    "message, expected",
     [
         ({"type": "drive", "wheels": [1, -0.5]}, messages.Drive("wheels", (1.0, -0.5))),
         ({"type": "drive", "toward": [2, -3.5]}, messages.Drive("point", (2.0, -3.5))),
@@ -57,7 +57,8 @@ def test_a_link_is_read_whole():
         '{"type":"fly"}', '{"type":"reset","extra":1}', '{"type":"reset","again":1}',
         '{"type":"drive","wheels":[NaN,0]}', '{"type":"drive","wheels":[Infinity,0]}',
         '{"type":"drive","wheels":[1e999,0]}', '{"type":"drive","wheels":[1.01,0]}',
-        '{"type":"drive","wheels":[1]}', '{"type":"drive","wheels":"11"}', '{"type":"drive","wheels":[true,0]}',
+        '{"type":"drive","wheels":[1]}', '{"type":"drive","wheels":"11"}',
+        '{"type":"drive","wheels":[true,0]}',
         '{"type":"drive","toward":[51,0]}', '{"type":"drive","toward":{"x":1}}',
         '{"type":"seen","frame":-1}', '{"type":"seen","frame":1.5}', '{"type":"seen","frame":1e400}',
         '{"type":"pause"}', '{"type":"pause","paused":"yes"}', '{"type":"pace","pace":0}',
@@ -65,7 +66,8 @@ def test_a_link_is_read_whole():
         '{"type":"set","values":{"evader_speed":9}}', '{"type":"set","values":{"control_period":1}}',
         '{"type":"set","values":[1]}', '{"type":"set","values":{"__class__":1}}',
         '{"type":"move","what":"floor","to":[0,0]}', '{"type":"move","what":"obstacle","index":1,"to":[0,0]}',
-        '{"type":"move","what":"evader","to":[0,"0"]}', '{"type":"move","what":"pursuer","to":[0,0],"heading":9}',
+        '{"type":"move","what":"evader","to":[0,"0"]}',
+        '{"type":"move","what":"pursuer","to":[0,0],"heading":9}',
         '{"type":"restore","scene":{}}', '{"type":"restore","scene":7}',
         "[" * 4000, '{"a":' * 600, '{"type":"reset","again":' + "1" * 4000 + "}", "é" * 3000,
         '{"type":"seen","frame":' + "9" * 400 + "}", '{"type":"pace","pace":' + "9" * 400 + "}",
@@ -77,7 +79,7 @@ def test_garbage_is_refused_with_words(text):
 
 
 @pytest.mark.parametrize(
-    ("name", "robots"),
+    "name, robots",
     [
         ("pursuers", []),
         ("pursuers", [[0, 0, 0], [1, 1, 1]]),
@@ -102,7 +104,7 @@ def test_sliders_reach_the_scenario_and_nothing_else_changes():
 
 
 @pytest.mark.parametrize(
-    ("change", "kind"),
+    "change, kind",
     [
         ({"capture_distance": 0.21}, "caught"),
         ({"evader_speed": 0.15}, "caught"),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, final
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -58,9 +60,12 @@ class Recording:
         if not len(said):
             raise ValueError("nothing has been recorded yet")
         first, told = self._place.split(begun), self._told.split(said)
-        worlds = World(
-            **{name: np.concatenate([first[name], told[name][-1:]]) for name in self._place.shapes}
-        )
+        parts = {name: np.concatenate([first[name], told[name][-1:]]) for name in self._place.shapes}
+        # Many worlds in one: made as a tree, since `World` itself is of one.
+        place = jnp.zeros(2)
+        one = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place)
+        names = [field.name for field in fields(World)]
+        worlds = jax.tree.unflatten(jax.tree.structure(one), [jnp.asarray(parts[name]) for name in names])
         flags = {name: jnp.asarray(told[name] > 0.5) for name in _FLAGS}
         rest = {name: jnp.asarray(told[name]) for name in EVENTS if name not in _FLAGS}
         return Trajectory(

@@ -208,9 +208,7 @@ async def _refuse(scope: Any, receive: Any, send: Any) -> None:
         await receive()
         await send({"type": "websocket.close", "code": 1008})
         return
-    text = (
-        b"This page answers to addresses and localhost; other names: sidestep play --allow-host NAME\n"
-    )
+    text = b"This page answers to addresses and localhost; other names: sidestep play --allow-host NAME\n"
     headers = [(b"content-type", b"text/plain"), (b"content-length", str(len(text)).encode())]
     await send({"type": "http.response.start", "status": 421, "headers": headers})
     await send({"type": "http.response.body", "body": text})

@@ -172,6 +172,7 @@ function draw(now) {
   }, now);
   chart.draw(colours);
   state.places = places;
+  if (setup.paused) canvas.dataset.evader = JSON.stringify(scene.camera.px(...places.evader).map(Math.round));
 }
 
 // What is being dragged is drawn where the pointer is.
