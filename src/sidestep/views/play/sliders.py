@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -55,7 +56,7 @@ def numbers_of(scenario: Scenario) -> dict[str, float]:
     fields = {slider.name for slider in SLIDERS} - {"obstacle_speed"}
     numbers = {name: plain(getattr(scenario, name)) for name in fields}
     drift = [plain(component) for component in scenario.obstacle_velocity]
-    return {**numbers, "obstacle_speed": round(float(np.hypot(*drift)), 6)}
+    return {**numbers, "obstacle_speed": round(math.hypot(*drift), 6)}
 
 
 def with_numbers(scenario: Scenario, numbers: Mapping[str, float]) -> Scenario:

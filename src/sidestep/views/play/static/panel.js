@@ -6,8 +6,8 @@ const byId = (id) => document.getElementById(id);
 const SHIELDS = {
   none: "No shield: the robot just drives at its target. Anybody catches it.",
   paper: "The paper's shield believes that the pursuer drives straight on. Come at it from the front and you have it.",
-  game: "Built on the solved pursuit game: it holds against every motion of the pursuer. Obstacles it may still hit.",
-  joint: "The game's shield that also looks ahead for a way past the obstacles. Nobody has caught it yet.",
+  game: "Built on the solved pursuit game: made to hold against every motion of the pursuer. Obstacles it may still hit.",
+  joint: "The game's shield that also looks ahead for a way past the obstacles. With the numbers it starts with nobody should catch it: try.",
 };
 const LEGEND = [
   ["evader", "robot"], ["pursuer", "pursuer, capture circle"], ["hull", "capture set K"], ["level", "level h"],

@@ -110,18 +110,21 @@ export class Scene {
     if (show.trails) this.drawTrails(places, frame, colours);
     for (const one of places.obstacles) this.obstacle(one, numbers.collision_distance, colours);
     this.target(places.target, view.reach, colours, now);
-    places.pursuers.forEach((pose, i) => {
+    for (const pose of places.pursuers) {
       const at = camera.px(pose[0], pose[1]);
       if (show.capture) this.sets(at, pose[2], numbers, places.evader, colours);
       else this.disc(at, numbers.capture_distance * scale, colours.pursuerFaint, colours.pursuer);
+    }
+    const evader = camera.px(...places.evader);
+    if (show.rows && frame.rows) this.rows(evader, frame.rows, numbers, view.counts[0], colours);
+    places.pursuers.forEach((pose, i) => {
+      const at = camera.px(pose[0], pose[1]);
       const wheels = (i === 0 && view.own) || (frame.wheels?.[i] ?? [0, 0]).map((w) => w / numbers.pursuer_speed);
       const rolled = (this.treads[i] ??= [0, 0]);
       if (frame.pace) wheels.forEach((share, side) => (rolled[side] += share * numbers.pursuer_speed * seconds));
       this.pursuer(at, pose[2], numbers.pursuer_half_axle * scale, rolled, colours, i === 0 && view.yours);
     });
     if (show.plan && frame.plan?.length) this.plan(places.evader, frame.plan, colours);
-    const evader = camera.px(...places.evader);
-    if (show.rows && frame.rows) this.rows(evader, frame.rows, numbers, view.counts[0], colours);
     this.evader(evader, frame, numbers, colours, now);
     if (show.velocities && frame.action) this.velocities(evader, frame, colours);
     if (view.goal) this.goal(view.goal, places.pursuers[0], colours);
