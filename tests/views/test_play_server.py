@@ -16,6 +16,7 @@ pytest.importorskip("uvicorn")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from sidestep.cli import main
 from sidestep.trials.rollout import load_trajectory
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import PlayError, listen, make_server
@@ -305,6 +306,15 @@ def test_an_allowance_fills_with_time_and_no_further_than_its_burst():
 def test_what_cannot_be_played_is_refused_at_the_start(field, value):
     with pytest.raises(ValueError, match=value):
         make_app(Hosting(Scenario(), **{field: value}))
+
+
+def test_the_command_refuses_with_words_and_status_2(capsys):
+    with listen("127.0.0.1", 0) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["play", "--port", port]) == 2
+    assert "--port" in capsys.readouterr().err
+    assert main(["play", "--shield", "armour"]) == 2
+    assert "armour" in capsys.readouterr().err
 
 
 def test_a_taken_port_is_refused_with_words():

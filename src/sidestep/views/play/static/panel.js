@@ -141,13 +141,13 @@ export class Panel {
 
   verdict({ kind, largest, margin }) {
     const box = byId("verdict");
-    const l = largest === null ? "any capture distance" : `a capture distance up to ${(1000 * largest).toFixed(1)} mm`;
-    const spare = margin === null ? "" : `; ${(1000 * margin).toFixed(1)} mm to spare`;
+    const l = largest === null ? "any capture distance" : `capture distances up to ${(1000 * largest).toFixed(1)} mm`;
+    const spare = margin === null ? "" : `, ${(1000 * margin).toFixed(1)} mm more`;
     const rate = this.hello ? `${Math.round(1 / this.hello.period)} decisions a second` : "this rate";
     const words = {
       caught: ["With these numbers it can be caught", largest > 0 ? `The best pursuer wins: l is ${(-1000 * margin).toFixed(1)} mm more than l_max.` : "The best pursuer wins."],
-      held: ["With these numbers it cannot be caught", `Certified at ${rate}, obstacles apart${spare}.`],
-      open: ["With these numbers it can stay free", `The game allows ${l}${spare}. At ${rate} that is not certified.`],
+      held: ["With these numbers it cannot be caught", `Certified at ${rate}, obstacles apart. The game allows ${l}${spare}.`],
+      open: ["With these numbers it can stay free", `The game allows ${l}${spare}. Not certified at ${rate}.`],
       unsure: ["With these numbers it can stay free", `The game allows ${l}${spare}.`],
     }[kind];
     box.dataset.kind = kind === "unsure" ? "open" : kind;
