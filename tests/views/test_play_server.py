@@ -156,6 +156,21 @@ def test_a_robot_put_before_the_pursuer_is_caught_and_the_game_goes_on(server):
         expect(socket, "frame", lambda frame: frame["over"] is None and frame["pace"] == 1.0)
 
 
+def test_a_target_that_is_guarded_gives_way_to_another(server, monkeypatch):
+    monkeypatch.setattr("sidestep.views.play.session._PATIENCE", 0.4)
+    with server.visit() as socket:
+        scene = {
+            "evader": [[0, 0]],
+            "target": [[40, 0]],
+            "pursuers": [[-2, 0, 0]],
+            "obstacles": [[1, -1, 0, 0]],
+        }
+        say(socket, type="restore", shield="none", pursuer="still", scene=scene)
+        frame = expect(socket, "frame", lambda frame: frame["target"] != [40.0, 0.0] and frame["pace"] == 1.0)
+        assert max(map(abs, frame["target"])) <= 1.5
+        assert frame["score"]["tallies"].get("none", {}).get("reached", 0) == 0
+
+
 def test_numbers_change_the_verdict_and_compile_nothing(server):
     program = server.app.state.programs["none"]
     with server.visit() as socket:

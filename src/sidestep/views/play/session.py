@@ -42,13 +42,16 @@ _EDGE = 0.4
 _CLEAR = 1.0
 """m; no obstacle turns back nearer than this to the robot."""
 _PLAN_EVERY = 5
+_PATIENCE = 30.0
+"""s after which a target that is not reached gives way to another: a pursuer may stand guard over one."""
 
 
 @final
 class Session:
     """A world that goes on period by period, for one visitor; not for several threads at once.
 
-    The robot drives from target to target: one that is reached is replaced by another. A capture or a
+    The robot drives from target to target: one that is reached, or not in half a minute, is
+    replaced by another. A capture or a
     collision ends the episode (`outcome`); `restart` begins the next. Nothing else is waited for: with the
     program of a shield still compiling, `advance` does nothing.
     """
@@ -180,7 +183,10 @@ class Session:
             tally.collided += 1
         elif told["reached"] > 0.0:
             tally.reached += 1
+        self._waited += self.period
+        if told["reached"] > 0.0 or self._waited > _PATIENCE:
             self._parts["target"] = self._another_target()
+            self._waited = 0.0
 
     def _another_target(self) -> np.ndarray:
         """A place in the square of the starts, clear of everything if one is found in 200 tries."""
@@ -215,7 +221,7 @@ class Session:
         """Go on from these parts of a world, which do not follow from what was."""
         self._parts = parts
         self._held, self._count = np.zeros(2), 0
-        self.outcome, self._told, self._plan = None, None, []
+        self.outcome, self._told, self._plan, self._waited = None, None, [], 0.0
         self.score.restart()
         self._break()
 
