@@ -219,9 +219,10 @@ def test_one_state_and_many_give_the_same(robot):
     np.testing.assert_array_equal(status, many.status)
 
 
-def test_filter_alone_with_several_robots_and_a_budget_decides_as_the_shield_does(tmp_path):
+@pytest.mark.parametrize("robots", [1, 2])
+def test_filter_alone_with_a_budget_decides_as_the_shield_does(robots, tmp_path):
     scenario = load_scenario(
-        "paper", pursuer_count=2, obstacle_count=2, arena_side=6.0, capture_distance=0.12
+        "paper", pursuer_count=robots, obstacle_count=robots, arena_side=6.0, capture_distance=0.12
     )
     budget = Budget(position_error=0.004, heading_error=0.01, delay=0.02, tracking_error=0.005)
     shield = make_shield("game", scenario, budget)
@@ -235,7 +236,7 @@ def test_filter_alone_with_several_robots_and_a_budget_decides_as_the_shield_doe
     del state["target"]
     ours = reference(scenario, shield, None, state)
     theirs = answers(tmp_path / "filter.onnx", state)
-    assert_same_decisions(ours, theirs, aside_of(state), 2, float(scenario.evader_speed))
+    assert_same_decisions(ours, theirs, aside_of(state), robots, float(scenario.evader_speed))
     assert np.all(ours.status[:20] == Status.INVALID)
 
 
@@ -306,7 +307,8 @@ velocity, status, barriers, slack, sides = step(*world, state["sides"])
 np.savez({str(tmp_path / "answer.npz")!r}, velocity=velocity, status=status, sides=sides)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
-    answer = np.load(tmp_path / "answer.npz")
+    with np.load(tmp_path / "answer.npz") as file:
+        answer = dict(file)
     np.testing.assert_allclose(answer["velocity"], robot.ours.velocity[1000:1003], atol=SAME)
     np.testing.assert_array_equal(answer["status"], robot.ours.status[1000:1003])
     np.testing.assert_array_equal(answer["sides"], robot.ours.sides[1000:1003])

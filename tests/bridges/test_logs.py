@@ -247,10 +247,15 @@ def test_report_of_a_log_stands_alone_and_tells_what_the_log_lacks(tmp_path, cap
     assert "Not in the log: events" in capsys.readouterr().out
 
 
-def test_evaluate_logs_the_episode_that_was_asked_for(tmp_path, capsys):
+def test_evaluate_logs_the_episode_that_was_asked_for(tmp_path, capsys, monkeypatch):
+    import sidestep.trials
     from sidestep.cli import main
+    from sidestep.commands import evaluate
     from sidestep.trials import episode_key, rollout
 
+    # What is measured is tested elsewhere, and would take longest here.
+    monkeypatch.setattr(sidestep.trials, "evaluate", lambda *_, **__: SimpleNamespace(to_dict=dict))
+    monkeypatch.setattr(evaluate, "evaluation_table", lambda _: "")
     path = tmp_path / "one.mcap"
     command = ["evaluate", "goal-seeking", "--shield", "none", "--pursuer", "still"]
     command += ["--episodes", "3", "--batch", "3", "--set"]

@@ -126,7 +126,7 @@ def test_the_leading_row_wins_over_the_others(precision):
 
 def test_jit_vmap_and_plain_calls_agree(precision, problems):
     dtype = jnp.zeros(()).dtype
-    for k, hard, circle in ((6, 2, False), (2, 1, True), (2, 1, False)):
+    for k, hard, circle in ((6, 2, False), (2, 1, True)):
         batch = problems(33, k, seed=16).cast(dtype)
         batched = _solve(batch, hard=hard, circle=circle)
         single = _compiled(hard=hard, circle=circle)

@@ -9,6 +9,9 @@ import pytest
 
 from sidestep.safety import Status, project
 
+# Derivatives are looked at as users have them compiled; the test run itself compiles at the lowest level.
+AS_USUAL = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
+
 
 def _solve(batch, hard=0, circle=False):
     batched = jax.vmap(functools.partial(project, hard=hard, circle=circle), in_axes=(0, 0, 0, None))
@@ -103,7 +106,7 @@ def test_gradients_are_true_where_they_exist(x64, problems, circle):
     tangent = tuple(jnp.asarray(rng.normal(size=p.shape) * s) for p, s in zip(point, size, strict=True))
     f = lambda *a: project(*a, batch.limit, hard=1, circle=circle).action  # noqa: E731
 
-    @jax.jit
+    @AS_USUAL
     @jax.vmap
     def both(point, tangent):
         forward = jax.jvp(f, point, tangent)[1]
@@ -138,7 +141,7 @@ def test_gradients_stay_finite_on_every_awkward_row(precision, problems, circle)
         answer = project(nominal, normals, offsets, batch.limit, hard=1, circle=circle)
         return jnp.sum(answer.action) + jnp.where(jnp.isfinite(answer.slack), answer.slack, 0.0)
 
-    gradients = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1, 2))))(
+    gradients = AS_USUAL(jax.vmap(jax.grad(total, argnums=(0, 1, 2))))(
         *(jnp.asarray(v) for v in (batch.nominal, batch.normals, batch.offsets))
     )
     assert all(np.all(np.isfinite(g)) for g in gradients)

@@ -12,6 +12,11 @@ from sidestep.safety.sampling_margin import TOUCH, guarded, sampling_margin
 from sidestep.world import World, load_scenario
 
 
+@eqx.filter_jit
+def _asked(shield, world, nominal):
+    return shield(world, nominal, shield.init(world))
+
+
 def test_margin_grows_with_the_square_of_the_period_up_to_half_of_what_there_is_to_spare():
     short, longer = (float(sampling_margin(load_scenario("paper", control_period=t))) for t in (0.01, 0.02))
     assert short == pytest.approx(0.2**2 * 0.01**2 / 0.2, rel=1e-5)
@@ -40,8 +45,7 @@ def test_barriers_are_reported_for_the_distances_of_capture_and_collision_themse
     world = World(
         jnp.zeros(2), jnp.array([[0.0, -0.3, 0.0]]), jnp.array([[0.0, 0.4, 0.02, 0.0]]), jnp.ones(2)
     )
-    shield = GameShield(scenario)
-    result, _ = shield(world, jnp.zeros(2), shield.init(world))
+    result, _ = _asked(GameShield(scenario), world, jnp.zeros(2))
     np.testing.assert_allclose(result.barriers, [0.1, 0.2], atol=1e-6)
 
 
@@ -92,9 +96,7 @@ def test_known_wheel_speeds_that_are_not_finite_fall_back_on_the_worst_case():
     scenario = load_scenario("paper")
     world = scenario.reset(jax.random.key(0))
     broken = eqx.tree_at(lambda w: w.wheel_speeds, world, jnp.full((1, 2), jnp.nan))
-    shield = GameShield(scenario, known_velocity=True)
-    wish = jnp.array([0.1, -0.1])
-    result, memory = shield(broken, wish, shield.init(broken))
+    result, memory = _asked(GameShield(scenario, known_velocity=True), broken, jnp.array([0.1, -0.1]))
     assert result.barriers.shape == (2,)
     assert int(result.status) in (Status.OK, Status.CORRECTED)
     rows = PursuitBarrier().rows(scenario, world, memory)
@@ -105,8 +107,7 @@ def test_a_known_pursuer_that_is_nowhere_is_invalid_and_the_rest_is_kept():
     scenario = load_scenario("paper", pursuer_count=2, obstacle_count=1)
     world = scenario.reset(jax.random.key(1))
     lost = eqx.tree_at(lambda w: w.pursuers, world, world.pursuers.at[1, 0].set(jnp.nan))
-    shield = GameShield(scenario, known_velocity=True)
-    result, _ = shield(lost, jnp.array([0.1, 0.0]), shield.init(lost))
+    result, _ = _asked(GameShield(scenario, known_velocity=True), lost, jnp.array([0.1, 0.0]))
     assert int(result.status) == Status.INVALID
     assert np.all(np.isfinite(result.action))
     np.testing.assert_array_equal(np.isinf(result.barriers), [False, True, False])

@@ -260,18 +260,14 @@ class GameShield(Shield):
 
     def _kept_rows(self, world: World, wish: Any, memory: Any) -> tuple[BarrierRows, Any]:
         """The rows at the distances that are kept, and the sides of the pursuers' axes that they follow."""
-        # Where the margin has been used up the row still holds what is left, and asks for no more.
+        # Where the margin has been used up the row still holds what is left, and asks for no more. Not so
+        # with the budget's: errors push inwards again and again, and the row leads back out.
         barrier = PursuitBarrier(eased=sampling_margin(self.scenario), budget=self.budget)
-        kept = guarded(self.scenario)
-        # The side is kept for as long as the distances themselves leave a choice: in the budget's margin
-        # there seems to be none, and errors would have the evader change sides all the time.
+        kept = guarded(self.scenario, self.budget)
         if self.wish_picks_side:
             memory = barrier.prefer(kept, world, memory, wish)
         else:
             memory = barrier.remember(kept, world, memory)
-        if self.budget is not None:
-            barrier = PursuitBarrier(eased=margins(self.scenario, self.budget)[0])
-            kept = guarded(self.scenario, self.budget)
         rows = _with_obstacles(barrier, kept, world, memory)
         if self.budget is None:
             return rows, memory

@@ -6,6 +6,8 @@ disc allow. What a candidate breaks costs so much more than its distance that th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sidestep.bridges.export.graph import Graph, Tensor
@@ -15,42 +17,57 @@ _EPS = float(np.finfo(np.float32).eps)
 TOLERANCE = 16.0 * _EPS
 """Largest violation of a row, in units of the speed limit, that counts as kept; as
 `sidestep.safety.tolerance`."""
-_ROUNDING = 8.0 * _EPS
+ROUNDING = 8.0 * _EPS
 _VOID = 1e30
 _PRICE = 1e12
 _FEASIBLE = 8.0
 _HARDER = 16.0
 
 
+CORRECTED, INFEASIBLE = 1.0, 2.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a filter says of its answer: one of `grades` (a status) applies where its column of
+    `parts @ weights` is more than `TOLERANCE`, and of those that apply the largest."""
+
+    parts: list[Tensor]
+    weights: np.ndarray
+    grades: tuple[float, ...]
+
+
 def closest(
-    graph: Graph, start: Tensor, rows: list[Row], hard: int, wish: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The nearest velocity to a wish that keeps all rows, in units of the speed limit.
+    graph: Graph, start: Tensor, rows: list[Row], hard: int, speed: float, wish: Tensor | None = None
+) -> tuple[Tensor, Verdict]:
+    """The nearest velocity to a wish that keeps all rows, `(batch, 2)` in m/s.
 
-    **Arguments:** `start (batch, 1, 2)` the wish, or its projection on the unit disc, and then the `wish`
-    itself; `rows` as in `rows_graph`, of which the first `hard` are kept first where not all can be.
-
-    **Returns** the velocity `(batch, 2)`, whether it is another than `start` (0 or 1, `(batch, 1)`), and
-    `(batch, 1, 1)` more than 0 where the rows cannot all hold.
+    **Arguments:** `start (batch, 2)` the wish in units of the speed limit `speed` (m/s), or its projection on
+    the unit disc, and then the `wish` itself; `rows` of which the first `hard` are kept first where not all
+    can be.
     """
     count = len(rows)
+    rows = [(normal.reshape(0, 1, 2), offset.reshape(0, 1, 1)) for normal, offset in rows]
+    begin = start.reshape(0, 1, 2)
+    aim = None if wish is None else wish.reshape(0, 1, 2)
     normals = graph.join(*(normal for normal, _ in rows), axis=1)
     offsets = graph.join(*(offset for _, offset in rows), axis=1)
     kept = graph.join(*relaxed(graph, rows, hard), axis=1)
-    given_way = (offsets - kept).over("ReduceMax", axis=1) - TOLERANCE
+    given_way = (offsets - kept).over("ReduceMax", axis=1)
     columns, limits = normals.transpose(0, 2, 1), kept.reshape(0, 1, count)
-    points = _on_lines(graph, start if wish is None else wish, normals, columns, kept, limits)
-    candidates = graph.join(start, points, axis=1)
+    points = _on_lines(graph, begin if aim is None else aim, normals, columns, kept, limits)
+    candidates = graph.join(begin, points, axis=1)
 
     missed = graph.join(candidates @ columns + limits, candidates.over("ReduceL2"))
     allowed = np.array([TOLERANCE] * count + [1.0 + TOLERANCE])
     price = _PRICE * np.array([_HARDER] * hard + [1.0] * (count - hard) + [_HARDER])
     broken = ((missed - allowed) * price).over("ReduceMax").apply("Relu")
-    cost = broken + _distance(graph, candidates, start, wish)
+    cost = broken + _distance(graph, candidates, begin, aim)
     best = graph.op("ArgMin", cost, axis=1, keepdims=0)
-    moved = graph.least(graph.op("Cast", best, to=1), 1.0)
-    infeasible = graph.largest(given_way, cost.over("ReduceMin", axis=1) - _FEASIBLE)
-    return graph.op("GatherND", candidates, best, batch_dims=1), moved, infeasible
+    infeasible = graph.largest(given_way, cost.over("ReduceMin", axis=1) - _FEASIBLE).reshape(-1, 1)
+    moved = graph.op("Cast", best, to=1)
+    velocity = graph.op("GatherND", candidates, best, batch_dims=1)
+    return velocity * speed, Verdict([moved, infeasible], np.eye(2), (CORRECTED, INFEASIBLE))
 
 
 def _distance(graph: Graph, candidates: Tensor, start: Tensor, wish: Tensor | None) -> Tensor:
@@ -74,9 +91,9 @@ def _on_lines(
     along = normals @ np.array([[0.0, -1.0], [1.0, 0.0]])
     slope = along @ columns
     # Where K is 0 this is no number, and not taken.
-    end = (kept * (normals @ columns) - limits + _ROUNDING) / slope
-    high = graph.where(slope > _ROUNDING, end, _VOID).over("ReduceMin")
-    low = graph.where(slope < -_ROUNDING, end, -_VOID).over("ReduceMax")
+    end = (kept * (normals @ columns) - limits + ROUNDING) / slope
+    high = graph.where(slope > ROUNDING, end, _VOID).over("ReduceMin")
+    low = graph.where(slope < -ROUNDING, end, -_VOID).over("ReduceMax")
     half = (1.0 - kept * kept).apply("Relu").apply("Sqrt")
     t = graph.least(graph.largest((along * wish).over("ReduceSum"), low), high)
     # The disc last: should the limits contradict each other, what is broken will show it.

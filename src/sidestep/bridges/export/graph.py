@@ -84,9 +84,13 @@ class Tensor:
         """Axes in another order."""
         return self.graph.op("Transpose", self, perm=list(order))
 
+    def take(self, indices: Sequence[int], axis: int = -1) -> Tensor:
+        """Entries by number along an axis."""
+        return self.graph.op("Gather", self, np.array(indices), axis=axis)
+
     def part(self, start: int, stop: int, axis: int = -1) -> Tensor:
         """Entries `start` to `stop` of an axis; onnxruntime gathers faster than it slices."""
-        return self.graph.op("Gather", self, np.arange(start, stop), axis=axis)
+        return self.take(range(start, stop), axis)
 
 
 class Graph:
@@ -98,6 +102,7 @@ class Graph:
         self._constants: dict[tuple[str, tuple[int, ...], bytes], tuple[str, np.ndarray]] = {}
         self._inputs: list[Any] = []
         self._outputs: list[Any] = []
+        self._renamed: dict[str, str] = {}
         self._known: dict[tuple[str, tuple[str, ...], str], Tensor] = {}
 
     @property
@@ -115,8 +120,8 @@ class Graph:
         return Tensor(self, name)
 
     def output(self, name: str, value: Tensor, *shape: int | str, kind: str = "FLOAT") -> None:
-        """Give `value` out under this name."""
-        self._nodes.append(self._onnx.helper.make_node("Identity", [value.name], [name]))
+        """Give `value`, the result of a node, out under this name."""
+        self._renamed[value.name] = name
         self._outputs.append(self._described(name, shape, kind))
 
     def constant(self, value: Any) -> Tensor:
@@ -155,6 +160,17 @@ class Graph:
         """`value` cut along its last axis."""
         return self.several("Split", len(sizes), value, np.array(sizes), axis=-1)
 
+    def linear(
+        self, value: Tensor, weights: np.ndarray, bias: Any = None, *, added: Tensor | None = None
+    ) -> Tensor:
+        """value @ weights + bias for `value (batch, n)`: the cheapest way to pick, repeat, scale and add up
+        columns. `added (batch, ...)` is a bias that is not constant; `bias` may be one number for all."""
+        if added is not None:
+            return self.op("Gemm", value, weights, added)
+        if bias is None:
+            return self.op("Gemm", value, weights)
+        return self.op("Gemm", value, weights, np.broadcast_to(np.asarray(bias, float), weights.shape[1:]))
+
     def join(self, *parts: Number, axis: int = -1) -> Tensor:
         """Parts one after the other along an axis."""
         return (
@@ -185,6 +201,9 @@ class Graph:
         **Raises** `onnx.checker.ValidationError` for a graph that is no valid ONNX.
         """
         onnx = self._onnx
+        for node in self._nodes:
+            for names in (node.input, node.output):
+                names[:] = [self._renamed.get(label, label) for label in names]
         constants = [onnx.numpy_helper.from_array(array, label) for label, array in self._constants.values()]
         graph = onnx.helper.make_graph(self._nodes, name, self._inputs, self._outputs, constants)
         model = onnx.helper.make_model(

@@ -13,7 +13,8 @@ _NONE = -1e30
 _EPS = float(np.finfo(np.float32).eps)
 
 Row: TypeAlias = tuple[Tensor, Tensor]
-"""N `(batch, 1, 2)` and c `(batch, 1, 1)`; several of them on the middle axis."""
+"""N = -n, which points towards the other robot, `(batch, 2)`, and c in units of the evader's speed `(batch,
+1)`; in this module with an axis in the middle for several of them."""
 
 
 def relaxed(graph: Graph, rows: list[Row], hard: int) -> list[Tensor]:

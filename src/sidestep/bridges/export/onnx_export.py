@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 
 from sidestep.bridges.export.files import as_text, facts, write_new
-from sidestep.bridges.export.filter_graph import TOLERANCE, closest
+from sidestep.bridges.export.filter_graph import CORRECTED, TOLERANCE, Verdict, closest
 from sidestep.bridges.export.graph import OPSET, Graph, Tensor
+from sidestep.bridges.export.pair_graph import closest_of_pair
 from sidestep.bridges.export.policy_graph import network, wished
 from sidestep.bridges.export.rows_graph import constants_of, rows_towards_all
 from sidestep.bridges.export.scene import NO_NUMBER, Scene, read_scene
 from sidestep.learning import LearnedPolicy
-from sidestep.safety import GameShield
+from sidestep.safety import GameShield, Status
 from sidestep.world import Scenario, observation_names, observation_size
 
+_STEEP = 1e12
 WHAT = ("policy+filter", "policy", "filter")
 """What can be exported."""
 _TEXTS = {
@@ -100,28 +102,42 @@ def _filtered(graph: Graph, shield: GameShield, policy: LearnedPolicy | None) ->
     scenario, constants = shield.scenario, constants_of(shield)
     m, speed = scenario.pursuer_count, float(scenario.evader_speed)
     scene = read_scene(graph, scenario, target=policy is not None)
-    wish, outside, valid = None, None, scene.valid
+    wish, outside, valid = None, [], scene.valid
     if policy is not None:
         start = wished(graph, scenario, policy, scene)
     else:
-        start, wish, outside, valid = _given_wish(graph, speed, scene)
+        start, wish, excess, valid = _given_wish(graph, speed, scene)
+        outside = [excess]
     rows, sides = rows_towards_all(graph, constants, scene, graph.input("sides", "batch", m))
-    velocity, moved, infeasible = closest(graph, start, rows, m, wish)
-    if outside is not None:
-        moved = graph.largest(moved, outside)
-    # The worst that applies: 1 corrected, 2 infeasible, 3 invalid.
-    worst = graph.largest(infeasible.apply("Sign").apply("Relu") * 2.0, 3.0 - valid * 3.0)
-    status = graph.largest(moved, worst.reshape(-1, 1)).reshape(-1)
-    graph.output("velocity", velocity * speed, "batch", 2)
-    graph.output("status", graph.op("Cast", status, to=6), "batch", kind="INT32")
+    if (m, len(rows)) == (1, 2):
+        velocity, verdict = closest_of_pair(graph, start, rows[0], rows[1], speed, wish)
+    else:
+        velocity, verdict = closest(graph, start, rows, m, speed, wish)
+    graph.output("velocity", velocity, "batch", 2)
+    graph.output("status", _status(graph, verdict, outside, valid), "batch", kind="INT32")
     graph.output("next_sides", sides, "batch", m)
 
 
+def _status(graph: Graph, verdict: Verdict, outside: list[Tensor], valid: Tensor) -> Tensor:
+    """The largest grade that applies: the filter's, corrected for a wish beyond the speed limit, invalid."""
+    given, flags = verdict.weights.shape
+    more = len(outside) + 1
+    weights = np.zeros((given + more, flags + more))
+    weights[:given, :flags] = verdict.weights
+    weights[given:, flags:] = np.diag([1.0] * len(outside) + [-1.0])
+    bias = np.array([-TOLERANCE] * (flags + len(outside)) + [0.5])
+    margins = graph.linear(graph.join(*verdict.parts, *outside, valid), _STEEP * weights, _STEEP * bias)
+    applies = graph.op("Clip", margins, 0.0, 1.0)
+    grades = np.array([*verdict.grades, *[CORRECTED] * len(outside), float(Status.INVALID)])
+    worst = graph.op("ReduceMax", applies * grades, axes=[1], keepdims=0)
+    return graph.op("Cast", worst, to=6)
+
+
 def _given_wish(graph: Graph, speed: float, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The input `wish` (m/s): its projection on the unit disc, itself in units of the speed limit, whether it
-    lies outside `(batch, 1)`, and whether everything that came in was finite."""
-    given = graph.input("wish", "batch", 2).reshape(0, 1, 2)
-    known = graph.op("ReduceL1", given, axes=[2], keepdims=1) < NO_NUMBER
+    """The input `wish` (m/s): its projection on the unit disc, itself in units of the speed limit, by how
+    much it lies outside, and whether everything that came in was finite; the last two `(batch, 1)`."""
+    given = graph.input("wish", "batch", 2)
+    known = given.over("ReduceL1") < NO_NUMBER
     valid = graph.op("Cast", known, to=1) * scene.valid
     wish = graph.where(known, given, 0.0) * (scene.valid * (1.0 / speed))
     length = wish.over("ReduceL2")
@@ -129,5 +145,4 @@ def _given_wish(graph: Graph, speed: float, scene: Scene) -> tuple[Tensor, Tenso
     start = wish / graph.largest(length, 1.0)
     # Far out only its direction matters.
     near = start * graph.largest(graph.least(length, farthest), 1.0)
-    outside = graph.op("Cast", length > 1.0 + TOLERANCE, to=1).reshape(-1, 1)
-    return start, near, outside, valid
+    return start, near, length - 1.0, valid

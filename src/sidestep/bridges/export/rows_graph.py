@@ -6,19 +6,18 @@ A row n.u >= c is kept as N = -n, which points towards the other robot, and c in
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from sidestep.bridges.export.graph import Graph, Tensor
-from sidestep.bridges.export.scene import Scene
+from sidestep.bridges.export.levels_graph import Row
+from sidestep.bridges.export.scene import Scene, for_each, picks
 from sidestep.pursuit import CaptureGame
-from sidestep.safety import Budget, GameShield
+from sidestep.safety import GameShield
 from sidestep.safety.barriers import KEEP_SIDE, LOST_SIDE, STEEPER
-from sidestep.safety.sampling_margin import guarded, margins
+from sidestep.safety.sampling_margin import guarded, sampling_margin
 
-_TINY = 1e-20
 _SMALLEST = 1e-30
 
 
@@ -46,7 +45,7 @@ class Constants:
 
 def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
     """Those of a `game` shield: of its rows, at the distances that it keeps, and of the choice of sides,
-    which knows of the budget only that it leaves a doubt on which side the evader is.
+    for which the budget also leaves a doubt on which side the evader is.
 
     **Raises** `ValueError` for what a graph cannot hold: a scenario of fixed speed, a pursuer gain of 0, a
     shield that is told the pursuers' velocities or lets the wish pick the side.
@@ -61,15 +60,16 @@ def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
         raise ValueError("scenario field 'pursuer_gain' = 0: an ONNX filter needs one greater than 0")
     if shield.known_velocity or shield.wish_picks_side:
         raise ValueError("an ONNX filter has the rows of make_shield('game', scenario); this shield's differ")
-    sides = _constants(shield, None)
+    kept = _constants(shield)
     if budget is None:
-        return sides, sides
+        return kept, kept
     doubts = float(budget.position_error), float(budget.heading_error)
-    return _constants(shield, budget), replace(sides, position_doubt=doubts[0], heading_doubt=doubts[1])
+    return kept, replace(kept, position_doubt=doubts[0], heading_doubt=doubts[1])
 
 
-def _constants(shield: GameShield, budget: Budget | None) -> Constants:
-    scenario, kept = shield.scenario, guarded(shield.scenario, budget)
+def _constants(shield: GameShield) -> Constants:
+    scenario, budget = shield.scenario, shield.budget
+    kept = guarded(scenario, budget)
     game, speed = CaptureGame.of(kept), float(scenario.evader_speed)
     usable = game.usable_angle
     gain = float(scenario.pursuer_gain)
@@ -86,7 +86,7 @@ def _constants(shield: GameShield, budget: Budget | None) -> Constants:
         gain=gain / speed,
         steep=max(gain, STEEPER * turning) / speed,
         spare=max(float(game.largest_capture_distance - game.capture_distance), 0.0),
-        eased=float(margins(scenario, budget)[0]),
+        eased=float(sampling_margin(scenario)),
         obstacle_gain=float(scenario.obstacle_gain) / speed,
         tracking_error=0.0 if budget is None else float(budget.tracking_error) / speed,
     )
@@ -94,9 +94,8 @@ def _constants(shield: GameShield, budget: Budget | None) -> Constants:
 
 def rows_towards_all(
     graph: Graph, constants: tuple[Constants, Constants], scene: Scene, sides: Tensor
-) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-    """N `(batch, 1, 2)` and c `(batch, 1, 1)` towards each pursuer, then each obstacle; and the next sides,
-    `(batch, m)`.
+) -> tuple[list[Row], Tensor]:
+    """The rows towards each pursuer, then each obstacle; and the next sides, `(batch, m)`.
 
     `constants` as `constants_of` gives them; `sides` are those of the call before: +1 left of a pursuer's
     axis, -1 right, 0 none yet.
@@ -108,119 +107,190 @@ def rows_towards_all(
     return rows, chosen
 
 
-def _one_by_one(normals: Tensor, offsets: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
+def _one_by_one(normals: Tensor, offsets: Tensor, count: int) -> list[Row]:
     if count == 1:
         return [(normals, offsets)]
-    return [(normals.part(i, i + 1, axis=1), offsets.part(i, i + 1, axis=1)) for i in range(count)]
+    return [(normals.part(2 * i, 2 * i + 2), offsets.part(i, i + 1)) for i in range(count)]
 
 
 def _towards_obstacles(graph: Graph, constants: Constants, scene: Scene) -> tuple[Tensor, Tensor]:
     """c = n.v - gain (distance - contact)."""
-    begin, end = scene.pursuers, scene.count
-    normals = scene.directions.part(begin, end, axis=1)
-    distances = scene.distances.part(begin, end, axis=1)
-    gain = constants.obstacle_gain
+    m, k, gain = scene.pursuers, scene.obstacles, constants.obstacle_gain
+    begin = 2 * scene.robots
+    normals = scene.shortened().part(begin, begin + 2 * k)
+    drifts = scene.flat.take([4 * (m + i) + axis for i in range(k) for axis in (2, 3)])
     fixed = gain * constants.collision + constants.tracking_error
-    weights = np.array([[-1.0 / constants.speed], [-1.0 / constants.speed], [-gain]])
-    return normals, graph.join(normals * scene.drifts, distances) @ weights + fixed
-
-
-def _turned(vectors: Tensor, headings: Tensor, signs: Any) -> Tensor:
-    """Vectors (x, y) by headings (c, s): (signs[0] x c + signs[1] y s, signs[2] y c + signs[3] x s)."""
-    terms = (vectors @ _TERMS[0]) * (headings @ _TERMS[1])
-    return terms @ (np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]) * np.reshape(signs, (4, 1)))
-
-
-_TERMS = (
-    np.array([[1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0]]),
-    np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]]),
-)
-"""They make [x c, y s, y c, x s] of (x, y) and (c, s)."""
+    near = graph.linear(scene.distances, picks(scene.robots, *({m + i: -gain} for i in range(k))), fixed)
+    along = for_each(k, [[-1.0 / constants.speed], [-1.0 / constants.speed]])
+    return normals, graph.linear(normals * drifts, along, added=near)
 
 
 def _towards_pursuers(
     graph: Graph, constants: tuple[Constants, Constants], scene: Scene, sides: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Both sides of each axis at once, [the other one, the evader's own], then the choice between them."""
-    m, headings = scene.pursuers, scene.headings
-    # The offset points from the evader to the pursuer; z the other way, in the pursuer's frame.
-    z = _turned(scene.offsets.part(0, m, axis=1), headings, [-1.0, -1.0, -1.0, 1.0])
-    end, own = graph.split((z + _SMALLEST).apply("Sign"), 1, 1)
-    away = z.apply("Abs")
-    shares = graph.largest(away, [_TINY, 0.0]) / graph.largest(z.over("ReduceL2"), _TINY)
-    rows, choice = constants
-    normal, h, rate = _both_sides(graph, rows, shares, away)
-    _, seen, _ = _both_sides(graph, choice, shares, away)
-    crossed = _crosses(graph, choice, away, seen, own * sides.reshape(0, m, 1))
-    # -1 where the other side is followed, else +1.
-    kept = (_SMALLEST - crossed).apply("Sign")
-    offsets = ((rate - _allowance(graph, rows, h)) * (kept * [-0.5, 0.5] + 0.5)).over("ReduceSum")
+    """N `(batch, 2 m)`, c `(batch, m)` and the sides that are followed."""
+    m, (rows, choice) = scene.pursuers, constants
+    # Vectors are turned by [x c, y s, y c, x s] of (x, y) and a heading (c, s).
+    turn = graph.linear(scene.headings, picks(2 * m, *({j: 1.0} for i in range(m) for j in (i, m + i) * 2)))
+    places = picks(4 * scene.robots, *({4 * i + j: 1.0} for i in range(m) for j in (0, 1, 1, 0)))
+    # The offset points from the evader to the pursuer; z the other way, in the pursuer's frame. Where z is 0
+    # it is taken to be ahead and left.
+    z = graph.linear(
+        graph.linear(scene.flat, places) * turn,
+        for_each(m, [[-1.0, 0.0], [-1.0, 0.0], [0.0, -1.0], [0.0, 1.0]]),
+        np.tile([1e-30, 1e-36], m),
+    )
+    signs, away = z.apply("Sign"), z.apply("Abs")
+    lengths = picks(scene.robots, *({i: 1.0} for i in range(m) for _ in (0, 1)))
+    shares = away / graph.linear(scene.distances, lengths, 1e-30)
+
+    bends = _bends(graph, rows, shares, m)
+    middle, half, *margins = _both_sides(graph, rows, bends, away, None, m)
+    if choice is not rows:
+        doubt = _doubt(graph, choice, scene, away)
+        _, _, *margins = _both_sides(graph, choice, _bends(graph, choice, shares, m), away, doubt, m)
+    own = signs.take([2 * i + 1 for i in range(m)])
+    # -1 where the other side than the evader's own is followed, else +1.
+    kept = (_SMALLEST - _crosses(graph, margins, own * sides)).apply("Sign")
+    chosen = own * kept
+    offsets = middle + kept * half
     if rows.tracking_error:
         offsets = offsets + rows.tracking_error
-    chosen = own * kept
-    body = normal * graph.join(end, chosen)
-    return _turned(body, headings, [-1.0, 1.0, -1.0, -1.0]), offsets, chosen.reshape(0, m)
+
+    both = graph.join(signs, chosen)
+    pointing = graph.linear(
+        both, picks(3 * m, *({j: 1.0} for i in range(m) for j in (2 * i, 2 * m + i, 2 * m + i, 2 * i)))
+    )
+    cosine, sine = rows.cosine, rows.sine
+    normal = graph.linear(
+        bends,
+        for_each(m, [[-1.0, 0.0, 0.0, -1.0], [0.0, 1.0, 1.0, 0.0]]),
+        np.tile([cosine, sine, sine, cosine], m),
+    )
+    back = for_each(m, [[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, -1.0]])
+    return graph.linear(pointing * normal * turn, back), offsets, chosen
+
+
+def _bends(graph: Graph, constants: Constants, shares: Tensor, m: int) -> Tensor:
+    """By how much n, in the quadrant ahead and left, lies beyond the tangent's direction: n = (cos S - first,
+    sin S + second), since it points along z beyond the usable angle S. `shares` is |z| by its length."""
+    limits = np.tile([constants.cosine, -constants.sine], m)
+    return graph.linear(shares, for_each(m, np.diag([-1.0, 1.0])), limits).apply("Relu")
+
+
+def _doubt(graph: Graph, constants: Constants, scene: Scene, away: Tensor) -> Tensor:
+    """How much of the evader's distance from the axis (m) is in doubt, at most all of it, `(batch, m)`."""
+    m = scene.pursuers
+    lengths = picks(scene.robots, *({i: constants.heading_doubt} for i in range(m)))
+    return graph.least(
+        graph.linear(scene.distances, lengths, constants.position_doubt),
+        away.take([2 * i + 1 for i in range(m)]),
+    )
 
 
 def _both_sides(
-    graph: Graph, constants: Constants, shares: Tensor, away: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """n in the quadrant ahead and left; h (m) and the pursuer's rate V max(|n_x|, |sigma|/b), each on [the
-    other side, the own]. `away` is |z| and `shares` that by its length."""
-    # Along z beyond the usable angle, the tangent's within it.
-    normal = graph.largest(graph.least(shares, [constants.cosine, 2.0]), [0.0, constants.sine])
-    products = (normal @ _PAIRS[0]) * (away @ _PAIRS[1])
-    turning = constants.pursuer_speed / constants.half_axle
-    values, moments = graph.split(
-        products
-        @ np.array(
-            [
-                [1.0, 1.0, 0.0, 0.0],
-                [0.0, 0.0, turning, turning],
-                [0.0, 0.0, turning, -turning],
-                [-1.0, 1.0, 0.0, 0.0],
-            ]
-        ),
-        2,
-        2,
+    graph: Graph, constants: Constants, bends: Tensor, away: Tensor, doubt: Tensor | None, m: int
+) -> list[Tensor]:
+    """What is to be known of either side of each pursuer's axis, the other one and the evader's own, each
+    `(batch, m)`: the middle and half the difference of their rows' offsets, and the margins of `_crosses`.
+
+    Everything here is piecewise linear in the products of n and z: two layers, as in a network, with the
+    positive part between them. |a| = (a)+ + (-a)+, max(a, b) = b + (a - b)+ and so on.
+    """
+    cosine, sine = constants.cosine, constants.sine
+    normal = graph.linear(
+        bends,
+        for_each(m, [[-1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]]),
+        np.tile([cosine, cosine, sine, sine], m),
     )
-    straight = normal.part(0, 1) * constants.pursuer_speed
-    return normal, values - constants.capture, graph.largest(moments.apply("Abs"), straight)
+    place = graph.linear(away, for_each(m, [[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]]))
+    terms = graph.join(normal * place, bends, away, *([] if doubt is None else [doubt]))
+    inner, outer = _layers(constants)
+    widths = (4, 2, 2) if doubt is None else (4, 2, 2, 1)
+    places = [sum(widths[:j]) * m + widths[j] * i + entry for i in range(m) for j in range(len(widths))
+              for entry in range(widths[j])]  # fmt: skip
+    used = sum(widths)
+    first = np.zeros((used * m, m * inner.shape[1]))
+    first[places] = for_each(m, inner[:used])
+    # By quantity, then by pursuer.
+    second = (
+        for_each(m, outer[:-1])
+        .reshape(-1, m, outer.shape[1])
+        .transpose(0, 2, 1)
+        .reshape(len(outer[:-1]) * m, -1)
+    )
+    hidden = graph.linear(terms, first, np.tile(inner[-1], m)).apply("Relu")
+    found = graph.linear(hidden, second, np.repeat(outer[-1], m))
+    return graph.split(found, *[m] * outer.shape[1])
 
 
-_PAIRS: tuple[Any, Any] = (
-    np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]]),
-    np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]]),
-)
-"""They make [n_x x, n_x y, n_y x, n_y y] of n and |z|."""
+def _layers(constants: Constants) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the two layers for one pursuer, a row per input, the last one the bias.
+
+    Inputs: n_x x, n_x y, n_y x, n_y y, the two of `_bends`, x and y of |z|, the doubt.
+    """
+    one = np.eye(10)
+    n_x_x, n_x_y, n_y_x, n_y_y, bend, _, ahead, aside, doubt, unit = one
+    turning = constants.pursuer_speed / constants.half_axle
+    straight = constants.pursuer_speed * (constants.cosine * unit - bend)
+    inner, outer_rows = [], []
+
+    def positive(form: np.ndarray) -> int:
+        inner.append(form)
+        return len(inner) - 1
+
+    sides = []
+    for sign in (-1.0, 1.0):
+        h = n_x_x + sign * n_y_y - constants.capture * unit - sign * constants.sine * doubt
+        moment = turning * (n_x_y - sign * n_y_x)
+        sides.append(
+            (
+                positive(h),
+                positive(-h),
+                positive(-h - constants.eased * unit),
+                positive(h - min(constants.spare, 1e9) * unit),
+                positive(moment - straight),
+                positive(-moment - straight),
+            )
+        )
+    base, across = positive(straight), positive(aside - doubt)
+    front = constants.sine * ahead - constants.cosine * aside
+    front_up, front_down = positive(front), positive(-front)
+
+    size = len(inner) + 1
+    hidden = np.eye(size)
+    bias = hidden[-1]
+    heights, offsets, reaches = [], [], []
+    for up, down, beyond, steep, left, right in sides:
+        height = hidden[up] - hidden[down]
+        allowed = (
+            constants.gain * (hidden[up] - hidden[beyond])
+            + (constants.steep - constants.gain) * hidden[steep]
+        )
+        turn = constants.cosine * constants.half_axle / constants.pursuer_speed
+        heights.append(height)
+        offsets.append(hidden[base] + hidden[left] + hidden[right] - allowed)
+        reaches.append(
+            turn * (allowed + constants.sure_speed * bias)
+            - constants.sine * (height + constants.capture * bias)
+        )
+    outer_rows = [
+        (offsets[0] + offsets[1]) / 2.0,
+        (offsets[1] - offsets[0]) / 2.0,
+        hidden[front_up] - hidden[front_down],
+        heights[0],
+        KEEP_SIDE * reaches[0] - hidden[across],
+        -heights[1],
+        -reaches[1],
+        LOST_SIDE * constants.capture * bias - hidden[across],
+    ]
+    return np.stack(inner, axis=1), np.stack(outer_rows, axis=1)
 
 
-def _allowance(graph: Graph, constants: Constants, h: Tensor) -> Tensor:
-    """alpha(h) of `PursuitBarrier`, in units of the evader's speed; it bends upwards above 0."""
-    gained = h * constants.gain
-    back = graph.least(gained + constants.gain * constants.eased, 0.0)
-    if not np.isfinite(constants.spare) or constants.steep == constants.gain:
-        return gained.apply("Relu") + back
-    beyond = h * constants.steep - (constants.steep - constants.gain) * constants.spare
-    return graph.largest(gained, beyond, 0.0) + back
-
-
-def _crosses(graph: Graph, constants: Constants, away: Tensor, h: Tensor, same: Tensor) -> Tensor:
+def _crosses(graph: Graph, margins: list[Tensor], same: Tensor) -> Tensor:
     """More than 0 where the side of the memory is not the evader's own (`same` is -1) and is kept all the
     same: the least of what is left of each condition, and the largest where one of two suffices."""
-    across = away.part(1, 2)
-    if constants.position_doubt or constants.heading_doubt:
-        # On which side the evader is can be told only so well.
-        doubt = away.over("ReduceL2") * constants.heading_doubt + constants.position_doubt
-        doubt = graph.least(doubt, across)
-        across = across - doubt
-        h = h + doubt * [constants.sine, -constants.sine]
-    turn = constants.cosine * constants.half_axle / constants.pursuer_speed
-    ease = turn * constants.sure_speed - constants.sine * constants.capture
-    reach = (_allowance(graph, constants, h) * turn + ease) - h * constants.sine
-    in_front = away @ np.array([[constants.sine], [-constants.cosine]])
-    h_other, h_own = graph.split(h, 1, 1)
-    reach_other, reach_own = graph.split(reach, 1, 1)
-    feasible = graph.least(h_other, reach_other * KEEP_SIDE - across)
-    lost = graph.least(-graph.least(h_own, reach_own), LOST_SIDE * constants.capture - across)
-    return graph.least(in_front, -0.5 - same, graph.largest(feasible, lost))
+    in_front, other, other_reach, lost, lost_reach, narrow = margins
+    feasible = graph.least(other, other_reach)
+    hopeless = graph.least(graph.largest(lost, lost_reach), narrow)
+    return graph.least(graph.least(in_front, -same), graph.largest(feasible, hopeless))

@@ -7,6 +7,7 @@ once, by a robot so far off that it matters to nobody; the status tells of it in
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,22 @@ from sidestep.world import Scenario
 NO_NUMBER = 1e15
 """Coordinates whose absolute values sum up to this (m) count as not finite: their squares would overflow."""
 _FAR = 1e6
-_TINY = 1e-20
+TINY = 1e-20
+"""A distance (m) that decides only where there is nothing else."""
+
+
+def picks(inputs: int, *columns: Mapping[int, float]) -> np.ndarray:
+    """Weights of `Graph.linear` by column: which of the `inputs` are added up, and how often."""
+    weights = np.zeros((inputs, len(columns)))
+    for column, terms in enumerate(columns):
+        for index, weight in terms.items():
+            weights[index, column] = weight
+    return weights
+
+
+def for_each(count: int, weights: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+    """The same weights for each of `count` robots, whose numbers follow one another."""
+    return np.kron(np.eye(count), np.asarray(weights))
 
 
 @dataclass(frozen=True)
@@ -25,7 +41,7 @@ class Scene:
     """The robots of a batch of worlds, all in world axes relative to the evader.
 
     **Attributes:** `rows (batch, robots, 4)`, all finite; `pursuers` m and `obstacles` k of them, the target
-    behind if `has_target`; `valid (batch, 1, 1)` 1.0 where everything that came in was finite, else 0.0.
+    behind if `has_target`; `valid (batch, 1)` 1.0 where everything that came in was finite, else 0.0.
     """
 
     graph: Graph
@@ -41,62 +57,65 @@ class Scene:
         return self.pursuers + self.obstacles
 
     @property
-    def offsets(self) -> Tensor:
-        """From the evader to each, `(batch, robots, 2)` in m."""
-        return self.rows.part(0, 2)
+    def robots(self) -> int:
+        """Rows: those, and the target if there is one."""
+        return self.count + self.has_target
+
+    @property
+    def flat(self) -> Tensor:
+        """The rows one after the other, `(batch, 4 robots)`."""
+        return self.rows.reshape(0, 4 * self.robots)
 
     @property
     def distances(self) -> Tensor:
-        """`(batch, robots, 1)` in m."""
-        return self.offsets.over("ReduceL2")
-
-    @property
-    def directions(self) -> Tensor:
-        """Unit vectors from the evader to each, `(batch, robots, 2)`; where it is upon it -x for an obstacle
-        and +x for the target, as the barrier and the observation have it."""
-        # So small that it decides only where there is nothing else.
-        nudge = np.zeros((self.count + 1, 2))
-        nudge[:, 0] = [-_TINY] * self.count + [_TINY]
-        rows = nudge if self.has_target else nudge[:-1]
-        return (self.offsets + rows) / self.graph.largest(self.distances, _TINY)
+        """From the evader to each, `(batch, robots)` in m."""
+        squares = self.flat * self.flat
+        return self.graph.linear(squares, for_each(self.robots, [[1.0], [1.0], [0.0], [0.0]])).apply("Sqrt")
 
     @property
     def headings(self) -> Tensor:
-        """Unit vectors along the pursuers' headings, `(batch, m, 2)`."""
-        angle = self.rows.part(0, self.pursuers, axis=1).part(2, 3)
-        return self.graph.join(angle.apply("Cos"), angle.apply("Sin"))
+        """Cosines of the pursuers' headings, then the sines, `(batch, 2 m)`."""
+        angles = self.flat.take([4 * i + 2 for i in range(self.pursuers)])
+        return self.graph.join(angles.apply("Cos"), angles.apply("Sin"))
 
-    @property
-    def drifts(self) -> Tensor:
-        """Velocities of the obstacles, `(batch, k, 2)` in m/s."""
-        return self.rows.part(self.pursuers, self.count, axis=1).part(2, 4)
+    def shortened(self) -> Tensor:
+        """Vectors from the evader, `(batch, 2 robots + 2 k)`: to pursuers and obstacles p/(1 + |p|), then
+        unit vectors to the target (if there is one) and to the obstacles.
+
+        Where the evader is upon it, the direction is +x to the target and -x to an obstacle, as observation
+        and barrier have it.
+        """
+        n, m, t = self.count, self.pursuers, int(self.has_target)
+        whole = list(range(n, n + t)) + list(range(m, n))
+        places = [*range(n), *whole]
+        offsets = picks(4 * self.robots, *({4 * i + axis: 1.0} for i in places for axis in (0, 1)))
+        nudge = np.zeros((len(places), 2))
+        nudge[n : n + t, 0], nudge[n + t :, 0] = TINY, -TINY
+        lengths = picks(self.robots, *({i: 1.0} for i in places for _ in (0, 1)))
+        more = np.repeat([1.0] * n + [TINY] * len(whole), 2)
+        graph = self.graph
+        return graph.linear(self.flat, offsets, nudge.reshape(-1)) / graph.linear(
+            self.distances, lengths, more
+        )
 
 
 def read_scene(graph: Graph, scenario: Scenario, *, target: bool) -> Scene:
     """The inputs `evader (batch, 2)`, `pursuers (batch, m, 3)`, `obstacles (batch, k, 4)` unless k = 0, and
     `target (batch, 2)` if asked for, as a `Scene`."""
     m, k = scenario.pursuer_count, scenario.obstacle_count
-    evader = _padded(graph, graph.input("evader", "batch", 2).reshape(0, 1, 2), 2)
-    rows = [_padded(graph, graph.input("pursuers", "batch", m, 3), 1)]
+    robots = m + k + target
+    padded = np.eye(2, 4)
+    evader = graph.linear(graph.input("evader", "batch", 2), np.tile(padded, robots)).reshape(0, robots, 4)
+    rows = [graph.op("Pad", graph.input("pursuers", "batch", m, 3), np.array([0, 0, 0, 0, 0, 1]))]
     # Away from the evader faster than it is far: no gain makes a row out of that.
     nowhere = [[0.0, -_FAR, 0.0, 0.0]] * m + [[_FAR, 0.0, _FAR, 0.0]] * k
     if k:
         rows.append(graph.input("obstacles", "batch", k, 4))
     if target:
-        rows.append(_padded(graph, graph.input("target", "batch", 2).reshape(0, 1, 2), 2))
+        rows.append(graph.linear(graph.input("target", "batch", 2), padded).reshape(0, 1, 4))
         nowhere.append([1.0, 0.0, 0.0, 0.0])
     seen = graph.join(*rows, axis=1) - evader
-    known = graph.op("ReduceL1", seen, axes=[2], keepdims=1) < NO_NUMBER
-    everything = graph.op("ReduceL1", seen, axes=[1, 2], keepdims=1) < NO_NUMBER
-    return Scene(
-        graph,
-        graph.where(known, seen, np.array(nowhere)),
-        m,
-        k,
-        target,
-        graph.op("Cast", everything, to=1),
-    )
-
-
-def _padded(graph: Graph, rows: Tensor, zeros: int) -> Tensor:
-    return graph.op("Pad", rows, np.array([0, 0, 0, 0, 0, zeros]))
+    known = seen.over("ReduceL1") < NO_NUMBER
+    valid = graph.op("ReduceMin", graph.op("Cast", known, to=1), axes=[1], keepdims=0)
+    kept = graph.where(known, seen, np.array(nowhere))
+    return Scene(graph, kept, m, k, target, valid)
