@@ -15,7 +15,7 @@ JOBS ?= 2
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test test-ros check format lock lock-ros docs bench clean
+.PHONY: help setup reproduce play test test-ros check format lock lock-ros docs bench clean
 
 help: ## This list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ $(READY): requirements.lock pyproject.toml
 
 reproduce: $(READY) ## Train and test as the paper does, without a shield, with its shield and with ours
 	$(VENV)/bin/sidestep reproduce --out runs/reproduce $(ARGS)
+
+play: $(READY) ## Serve the page in which you try to catch the robot
+	$(VENV)/bin/sidestep play $(ARGS)
 
 test: $(READY) ## Run the tests (those marked slow: make test ARGS='-m slow')
 	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import subcommand
 
 from sidestep._compiled import keep_compiled_programs
-from sidestep.commands import bench, certify, evaluate, export, falsify, report, reproduce, train, twin
+from sidestep.commands import bench, certify, evaluate, export, falsify, play, report, reproduce, train, twin
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
@@ -18,6 +18,7 @@ _RUN: dict[type, Callable[..., int]] = {
     reproduce.Reproduce: reproduce.run,
     certify.Certify: certify.run,
     falsify.Falsify: falsify.run,
+    play.Play: play.run,
     report.Report: report.run,
     export.Export: export.run,
     twin.Twin: twin.run,
@@ -33,6 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[reproduce.Reproduce, subcommand("reproduce")]
         | Annotated[certify.Certify, subcommand("certify")]
         | Annotated[falsify.Falsify, subcommand("falsify")]
+        | Annotated[play.Play, subcommand("play")]
         | Annotated[report.Report, subcommand("report")]
         | Annotated[export.Export, subcommand("export")]
         | Annotated[twin.Twin, subcommand("twin")]

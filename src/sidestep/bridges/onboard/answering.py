@@ -14,12 +14,9 @@ from jaxtyping import Array, Float
 
 from sidestep._arrays import length, real
 from sidestep.learning.control_step import decide
-from sidestep.pursuit import make_pursuer, pursue
-from sidestep.safety import JointShield, PursuitBarrier, Shield
-from sidestep.safety.look_ahead import clearance, stretch, wish
+from sidestep.safety import PursuitBarrier, Shield
+from sidestep.safety.look_ahead import clearance
 from sidestep.world import Scenario, World
-
-_PLAN_POINTS = 33
 
 Numbers = Float[np.ndarray, "n"]
 
@@ -145,23 +142,3 @@ def _answer(
     status = result.status.astype(nominal.dtype)
     near = clearance(scenario, world)
     return [nominal, result.action, status, result.slack, result.intervention, near, result.barriers], memory
-
-
-@eqx.filter_jit
-def way_out(shield: JointShield, world: World, memory: Any) -> Float[Array, "n 2"]:
-    """Where (m) the way out that the shield counts on leads, against a pursuer that plays `nash`."""
-    scenario, game, pursuer = shield.scenario, shield.rows_only, make_pursuer("nash")
-    steps = _PLAN_POINTS - 1
-    period = shield.horizon / steps
-    paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, period)
-
-    def step(carry: Any, count: Array) -> Any:
-        world, sides = carry
-        age = memory.age + period * count
-        wished = wish(paced, world, sides, stretch(memory.way, age, shield.horizon / len(memory.way)))
-        action, sides = game.heed(world, wished, sides)
-        moved = paced.moved(world, action, pursue(paced, pursuer, world, jax.random.key(0)))
-        return (moved, sides), moved.evader
-
-    _, way = jax.lax.scan(step, (world, memory.sides), jnp.arange(steps).astype(period.dtype))
-    return jnp.concatenate([world.evader[None], way])

@@ -17,7 +17,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.bridges.onboard.answering import Answering, Numbers, Seen, way_out
+from sidestep.bridges.onboard.answering import Answering, Numbers, Seen
 from sidestep.bridges.onboard.decision import LEVELS, Decision
 from sidestep.bridges.onboard.readings import Gate, Reading
 from sidestep.bridges.onboard.settings import OnboardSettings
@@ -25,6 +25,7 @@ from sidestep.bridges.onboard.tracks import EvaderTrack, ObstacleTrack, PursuerT
 from sidestep.learning import load_policy
 from sidestep.learning.control_step import decision_steps_of
 from sidestep.safety import JointShield, Shield, Status, make_shield
+from sidestep.safety.way_out import way_out
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario
 

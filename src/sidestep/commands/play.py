@@ -1,0 +1,98 @@
+"""`sidestep play`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from sidestep.commands.common import Overrides, PursuerName, ShieldName, parse_overrides
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Play:
+    """Serve a page in which you drive the pursuer and try to catch the shielded robot."""
+
+    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
+    """Run folder whose policy drives the robot, or goal-seeking for the untrained one."""
+    scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Preset or file; the run's own scenario, or paper, by default."""
+    shield: ShieldName = "joint"
+    """Shield at first: none, paper, game or joint."""
+    pursuer: PursuerName = "you"
+    """Pursuer at first: you, or a strategy such as nash."""
+    set: Overrides = ()
+    """Scenario fields to change, such as obstacle_count=2."""
+    seed: int = 0
+    """Seed of the first visitor's starts and targets."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets everybody in who can reach this machine."""
+    port: int = 8765
+    """Port to listen on; 0 takes a free one."""
+    allow_host: tuple[str, ...] = ()
+    """Names under which others reach this machine, beside its addresses."""
+    visitors: int = 8
+    """Most visitors at once."""
+    open: bool = False
+    """Also open the page in the browser."""
+
+
+def run(command: Play, console: Console) -> int:
+    """Run `sidestep play` until Ctrl-C; returns the exit status."""
+    from sidestep.learning import load_policy
+    from sidestep.learning.records import open_run
+    from sidestep.views.play import Hosting, Limits, serve
+    from sidestep.world import load_scenario
+
+    overrides = parse_overrides(command.set)
+    policy: Any = command.run
+    config: dict[str, Any] = {}
+    if command.run != "goal-seeking":
+        policy = load_policy(command.run)
+        config = open_run(command.run) if Path(command.run).is_dir() else {}
+    if command.scenario is None and config:
+        scenario = load_scenario("paper", **{**config["scenario"], **overrides})
+    else:
+        scenario = load_scenario(command.scenario or "paper", **overrides)
+    hosting = Hosting(
+        scenario,
+        policy,
+        command.shield,
+        command.pursuer,
+        command.seed,
+        Limits(visitors=command.visitors),
+        command.allow_host,
+        _savers(),
+    )
+
+    def announce(address: str) -> None:
+        console.print(f"The page: {address}", highlight=False)
+        console.print("Ctrl-C ends it.", highlight=False)
+        if command.open:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    serve(hosting, command.host, command.port, announce=announce)
+    return 0
+
+
+def _savers() -> dict[str, Any]:
+    """Logs of robotics people's tools too, where their library is installed."""
+    try:
+        import mcap  # noqa: F401
+    except ModuleNotFoundError:
+        return {}
+    from sidestep.bridges.logs import save_log
+
+    def save(path: Path, trajectory: Any, scenario: Any, about: Mapping[str, Any]) -> None:
+        save_log(trajectory, scenario, path, about=about)
+
+    return {"mcap": save}

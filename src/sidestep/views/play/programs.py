@@ -1,0 +1,67 @@
+"""Compiled control steps, shared by all visitors and compiled out of their way."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, final
+
+from sidestep.safety.catalogue import SHIELDS
+from sidestep.views.play.program import Program, Starts, traced
+from sidestep.world import Scenario
+
+COLD, WARMING, READY, FAILED = "cold", "warming", "ready", "failed"
+"""How far the program of a shield is."""
+
+_log = logging.getLogger(__name__)
+
+
+@final
+class Programs:
+    """The program of every shield for one scenario, each compiled when it is first wanted.
+
+    `warm` returns at once; a thread of its own does the work, one shield after the other.
+    """
+
+    def __init__(self, scenario: Scenario, policy: Callable[..., Any]):
+        self.scenario, self.policy = scenario, policy
+        self._programs = {name: Program(scenario, name, policy) for name in SHIELDS}
+        self.layout = next(iter(self._programs.values()))
+        self.starts = Starts(scenario, self.layout.place)
+        self._states = dict.fromkeys(SHIELDS, COLD)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="sidestep-compile")
+
+    def __getitem__(self, shield: str) -> Program:
+        return self._programs[shield]
+
+    @property
+    def states(self) -> dict[str, str]:
+        """How far each shield is."""
+        return dict(self._states)
+
+    def ready(self, shield: str) -> bool:
+        """Whether `shield` can be stepped without waiting."""
+        return self._states[shield] == READY
+
+    def warm(self, *shields: str) -> None:
+        """Have these compiled, in this order, those that are not yet."""
+        for shield in shields:
+            if self._states[shield] == COLD:
+                self._states[shield] = WARMING
+                self._worker.submit(self._compile, shield)
+
+    def close(self) -> None:
+        """Compile nothing more."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _compile(self, shield: str) -> None:
+        try:
+            program = self._programs[shield]
+            vector = program.vector(self.starts(self.scenario, 0))
+            program.compile(traced(self.scenario, self.policy), vector)
+            self._states[shield] = READY
+        except Exception:
+            # Nobody waits for this thread: what went wrong is said in the log and on the page.
+            _log.exception("the shield %s could not be compiled", shield)
+            self._states[shield] = FAILED

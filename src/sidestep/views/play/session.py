@@ -1,0 +1,386 @@
+"""One visitor's world: what happens in it, and what the visitor is told of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, final
+
+import numpy as np
+
+from sidestep.safety.situation import plain
+from sidestep.safety.status import Status
+from sidestep.views.play import helm
+from sidestep.views.play.limits import Limits
+from sidestep.views.play.messages import (
+    YOU,
+    Drive,
+    Message,
+    MessageError,
+    Move,
+    Numbers,
+    Pace,
+    Pause,
+    Pick,
+    Reader,
+    Reset,
+    Restore,
+    Seen,
+    Show,
+    Step,
+)
+from sidestep.views.play.program import traced
+from sidestep.views.play.programs import Programs
+from sidestep.views.play.recording import Recording
+from sidestep.views.play.score import Score
+from sidestep.views.play.sliders import drifts_at, numbers_of, sliders_for, with_numbers
+from sidestep.views.play.verdict import quick_verdict, verdict
+from sidestep.world import Scenario
+
+_MODES = {"none": helm.BY_WHEELS, "wheels": helm.BY_WHEELS, "point": helm.BY_POINT}
+_EDGE = 0.4
+"""m beyond the square of the starts, where an obstacle turns back."""
+_CLEAR = 1.0
+"""m; no obstacle turns back nearer than this to the robot."""
+_PLAN_EVERY = 5
+_PATIENCE = 30.0
+"""s after which a target that is not reached gives way to another: a pursuer may stand guard over one."""
+
+
+@final
+class Session:
+    """A world that goes on period by period, for one visitor; not for several threads at once.
+
+    The robot drives from target to target: one that is reached, or not in half a minute, is
+    replaced by another. A capture or a
+    collision ends the episode (`outcome`); `restart` begins the next. Nothing else is waited for: with the
+    program of a shield still compiling, `advance` does nothing.
+    """
+
+    def __init__(self, programs: Programs, shield: str, pursuer: str, limits: Limits, seed: int):
+        self.programs, self.limits = programs, limits
+        self.base: Scenario = programs.scenario
+        self.sliders = sliders_for(self.base)
+        self.reader = Reader(
+            self.sliders, self.base.pursuer_count, self.base.obstacle_count, limits.message_bytes
+        )
+        self.period = plain(self.base.control_period)
+        self.shield, self.pursuer = shield, pursuer
+        self.paused, self.pace = False, 1.0
+        self.show = Show(rows=False, plan=False)
+        self.score = Score()
+        self.outcome: str | None = None
+        self.frame_number = 0
+        self._random = np.random.default_rng(seed)
+        self._recording = Recording(programs.layout.place, programs.layout.told, limits.recorded_periods)
+        self._drive = Drive("none", (0.0, 0.0))
+        self._told: dict[str, Any] | None = None
+        self._plan: list[list[float]] = []
+        self._cut = True
+        self._set_numbers(numbers_of(self.base))
+        self.restart()
+        programs.warm(shield)
+
+    # What the visitor asks for.
+
+    def apply(self, message: Message) -> None:
+        """Do what a message says. **Raises** `MessageError` for what cannot be done now."""
+        match message:
+            case Drive():
+                self._drive = message
+                if message.mode != "none" and self.pursuer != YOU:
+                    self._pick(Pick(None, YOU))
+            case Pause(paused):
+                self.paused = paused
+            case Step():
+                self._single_step()
+            case Pace(pace):
+                self.pace = pace
+            case Reset(again):
+                self.restart(again=again)
+            case Pick():
+                self._pick(message)
+            case Numbers():
+                self._slide(message)
+            case Move():
+                self._move(message)
+            case Show():
+                self.show = message
+            case Restore():
+                self._restore(message)
+            case Seen():
+                pass
+
+    def restart(self, *, again: bool = False) -> None:
+        """Begin an episode, from a new start or `again` from the last."""
+        if not again:
+            seed = int(self._random.integers(2**31))
+            self._start = self.programs.starts(self.scenario, seed)
+        self._begin({name: part.copy() for name, part in self._start.items()})
+
+    @property
+    def ready(self) -> bool:
+        """Whether the shield's program is compiled."""
+        return self.programs.ready(self.shield)
+
+    @property
+    def moving(self) -> bool:
+        """Whether time goes on."""
+        return self.ready and not self.paused and self.outcome is None
+
+    def settle(self) -> None:
+        """Find out what takes some 20 ms to know of new numbers: whether the certificate holds."""
+        self.verdict = verdict(self.numbers, self.period, self.base.pursuer_count)
+
+    @property
+    def settled(self) -> bool:
+        """Whether `settle` has nothing to add."""
+        return self.verdict.kind != "unsure"
+
+    # What happens.
+
+    def advance(self) -> dict[str, Any]:
+        """One control period, if the world moves at all, and the frame that shows it."""
+        if not self.moving:
+            return self.frame()
+        begun = {name: np.array(part) for name, part in self._parts.items()}
+        self._period()
+        return self._frame_of(begun, self.pace)
+
+    def _period(self) -> None:
+        program = self.programs[self.shield]
+        vector = program.vector(
+            {
+                **self._parts,
+                "held": self._held,
+                "ask": self._count % self.decision_steps == 0,
+                "strategy": helm.STRATEGIES.index("nash" if self.pursuer == YOU else self.pursuer),
+                "mode": _MODES[self._drive.mode] if self.pursuer == YOU else helm.BY_STRATEGY,
+                "wanted": self._drive.wanted,
+                "count": self._count % 2**20,
+            }
+        )
+        if self._memory is None:
+            self._memory = program.begin(self._arrays, vector)
+        if self.show.plan and program.plans and self._count % _PLAN_EVERY == 0:
+            looking = self._told is not None and self._told["looking"] > 0.0
+            self._plan = _rounded(program.plan(self._arrays, vector, self._memory)) if looking else []
+        said, self._memory = program.step(self._arrays, vector, self._memory)
+        told = self._told = program.told.split(np.asarray(said, np.float64))
+        self._recording.add(vector[: program.place.size], said)
+        self._parts = {name: told[name] for name in program.place.shapes}
+        self._held, self._count = told["nominal"], self._count + 1
+        self.score.lasted(self.shield, self.period)
+        self._judge(told)
+        self._turn_obstacles_back()
+
+    def _judge(self, told: dict[str, Any]) -> None:
+        tally = self.score.of(self.shield)
+        if told["captured"] > 0.0:
+            self.outcome = "captured"
+            tally.captured += 1
+        elif told["collided"] > 0.0:
+            self.outcome = "collided"
+            tally.collided += 1
+        elif told["reached"] > 0.0:
+            tally.reached += 1
+        self._waited += self.period
+        if told["reached"] > 0.0 or self._waited > _PATIENCE:
+            self._parts["target"] = self._another_target()
+            self._waited = 0.0
+
+    def _another_target(self) -> np.ndarray:
+        """A place in the square of the starts, clear of everything if one is found in 200 tries."""
+        half = 0.45 * float(self.base.arena_side)
+        clear = self.numbers["collision_distance"] + 0.15
+        tip = self.numbers["capture_distance"] + 0.15
+        for _ in range(200):
+            place = self._random.uniform(-half, half, 2)
+            far = np.hypot(*(place - self._parts["evader"])) >= float(self.base.target_separation)
+            if (
+                far
+                and np.all(_distances(self._parts["obstacles"], place) > clear)
+                and np.all(_distances(self._parts["pursuers"], place) > tip)
+            ):
+                break
+        return place
+
+    def _turn_obstacles_back(self) -> None:
+        """Obstacles drift straight on for ever; here they come back, so that the game keeps them."""
+        edge = 0.5 * float(self.base.arena_side) + _EDGE
+        obstacles = self._parts["obstacles"].copy()
+        away = _distances(obstacles, self._parts["evader"]) > _CLEAR
+        for axis in (0, 1):
+            leaving = obstacles[:, axis] * obstacles[:, 2 + axis] > 0.0
+            turns = (np.abs(obstacles[:, axis]) > edge) & leaving & away
+            obstacles[turns, 2 + axis] *= -1.0
+        self._parts["obstacles"] = obstacles
+
+    # How messages change the world.
+
+    def _begin(self, parts: dict[str, Any]) -> None:
+        """Go on from these parts of a world, which do not follow from what was."""
+        self._parts = parts
+        self._held, self._count = np.zeros(2), 0
+        self.outcome, self._told, self._plan, self._waited = None, None, [], 0.0
+        self.score.restart()
+        self._break()
+
+    def _break(self) -> None:
+        """What comes does not follow from what was: the shield remembers nothing, the recording begins."""
+        self._memory, self._cut = None, True
+        self._recording.restart()
+
+    def _pick(self, pick: Pick) -> None:
+        if pick.shield is not None and pick.shield != self.shield:
+            self.shield = pick.shield
+            self.programs.warm(pick.shield)
+            self.score.restart()
+            self._break()
+        if pick.pursuer is not None and pick.pursuer != self.pursuer:
+            self.pursuer = pick.pursuer
+            self.score.restart()
+
+    def _set_numbers(self, numbers: dict[str, float]) -> None:
+        self.numbers = numbers
+        self.scenario = with_numbers(self.base, numbers)
+        self._arrays = traced(self.scenario, self.programs.policy)
+        self.verdict = quick_verdict(numbers, self.period)
+
+    def _slide(self, message: Numbers) -> None:
+        before = numbers_of(self.base) if message.defaults else self.numbers
+        numbers = {**before, **message.values}
+        if numbers == self.numbers:
+            return
+        faster = numbers["obstacle_speed"] != self.numbers["obstacle_speed"]
+        self._set_numbers(numbers)
+        if faster:
+            obstacles = self._parts["obstacles"].copy()
+            obstacles[:, 2:] = drifts_at(obstacles[:, 2:], numbers["obstacle_speed"])
+            self._parts["obstacles"] = obstacles
+        if self._touching():
+            self.restart()
+            return
+        self.score.restart()
+        self._break()
+
+    def _touching(self) -> bool:
+        """Whether the robot is caught or has collided where everything is now."""
+        evader, numbers = self._parts["evader"], self.numbers
+        caught = _distances(self._parts["pursuers"], evader) <= numbers["capture_distance"]
+        collided = _distances(self._parts["obstacles"], evader) <= numbers["collision_distance"]
+        return bool(np.any(caught) or np.any(collided))
+
+    def _move(self, message: Move) -> None:
+        if not self.paused:
+            raise MessageError("pause first, then drag")
+        parts = {name: part.copy() for name, part in self._parts.items()}
+        if message.what in ("evader", "target"):
+            parts[message.what] = np.array(message.place)
+        else:
+            robot = parts[f"{message.what}s"][message.index]
+            robot[:2] = message.place
+            if message.heading is not None and message.what == "pursuer":
+                robot[2] = (message.heading + np.pi) % (2.0 * np.pi) - np.pi
+        self._start = {name: part.copy() for name, part in parts.items()}
+        self._start["time"] = np.zeros(())
+        self._begin(parts)
+
+    def _restore(self, message: Restore) -> None:
+        self._slide(Numbers(message.numbers.values, defaults=True))
+        self._pick(message.pick)
+        if message.scene is None:
+            return
+        scene = message.scene
+        parts = {
+            "evader": np.array(scene["evader"][0]),
+            "pursuers": np.array(scene["pursuers"], float).reshape(-1, 3),
+            "obstacles": np.array(scene["obstacles"], float).reshape(-1, 4),
+            "target": np.array(scene["target"][0]),
+            "time": np.zeros(()),
+            "evader_velocity": np.zeros(2),
+            "wheel_speeds": np.zeros((self.base.pursuer_count, 2)),
+        }
+        self._start = {name: part.copy() for name, part in parts.items()}
+        self._begin(parts)
+
+    def _single_step(self) -> None:
+        if self.ready and self.paused and self.outcome is None:
+            self._period()
+
+    @property
+    def decision_steps(self) -> int:
+        """Control periods between two decisions of the policy."""
+        return int(getattr(self.programs.policy, "decision_steps", 1))
+
+    # What the visitor is told.
+
+    def frame(self) -> dict[str, Any]:
+        """The world as it stands, with the commands of the last period."""
+        return self._frame_of(self._parts, 0.0)
+
+    def _frame_of(self, parts: dict[str, Any], pace: float) -> dict[str, Any]:
+        """The world at the beginning of a period and the commands held in it; `pace` 0: it stands still.
+
+        With these the page knows every robot's motion until the next frame exactly.
+        """
+        self.frame_number += 1
+        told = self._told
+        frame: dict[str, Any] = {
+            "type": "frame",
+            "frame": self.frame_number,
+            "pace": pace,
+            "cut": self._cut,
+            "time": round(float(parts["time"]), 4),
+            "evader": _rounded(parts["evader"]),
+            "pursuers": _rounded(parts["pursuers"]),
+            "obstacles": _rounded(parts["obstacles"]),
+            "target": _rounded(parts["target"]),
+            "over": self.outcome,
+            "score": self.score.to_dict(),
+        }
+        self._cut = False
+        if told is not None:
+            frame |= {
+                "action": _rounded(told["action"]),
+                "nominal": _rounded(np.nan_to_num(told["nominal"])),
+                "wheels": _rounded(told["wheels"]),
+                "h": _rounded(told["h"]),
+                "barriers": _rounded(np.nan_to_num(told["barriers"], neginf=0.0)),
+                "intervention": round(float(told["intervention"]), 5),
+                "status": Status.NAMES[int(told["status"])],
+                "reached": bool(told["reached"] > 0.0),
+                "looking": bool(told["looking"] > 0.0),
+            }
+            if self.show.rows:
+                frame["rows"] = _rounded(np.column_stack([told["normals"], told["offsets"]]))
+            if self.show.plan:
+                frame["plan"] = self._plan
+        return frame
+
+    def setup(self) -> dict[str, Any]:
+        """What the visitor has chosen, and what it means; sent when it changes."""
+        return {
+            "type": "setup",
+            "shield": self.shield,
+            "pursuer": self.pursuer,
+            "paused": self.paused,
+            "pace": self.pace,
+            "numbers": self.numbers,
+            "verdict": self.verdict.to_dict(),
+            "states": self.programs.states,
+            "ready": self.ready,
+            "show": asdict(self.show),
+        }
+
+    def record(self) -> tuple[Recording, tuple[np.ndarray, np.ndarray], Scenario, dict[str, Any]]:
+        """What has been recorded of this episode, the scenario it was played in, and what to say about it."""
+        about = {"shield": self.shield, "pursuer": self.pursuer, "source": "sidestep play"}
+        return self._recording, self._recording.copy(), self.scenario, about
+
+
+def _rounded(values: Any) -> Any:
+    return np.round(np.asarray(values, float), 5).tolist()
+
+
+def _distances(robots: Any, place: Any) -> Any:
+    return np.hypot(robots[:, 0] - place[0], robots[:, 1] - place[1])

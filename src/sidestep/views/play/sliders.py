@@ -1,0 +1,105 @@
+"""Which numbers of the scenario may a visitor change, and within which bounds?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from sidestep._arrays import real
+from sidestep.safety.situation import plain
+from sidestep.world import Scenario
+
+_TIP_ROOM = 0.3
+"""How far (m) from the tip of the capture set an episode starts at least."""
+
+
+@dataclass(frozen=True)
+class Slider:
+    """One number: its name, what the page calls it, unit, bounds and step."""
+
+    name: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    step: float
+
+
+SLIDERS = (
+    Slider("evader_speed", "Robot's speed", "m/s", 0.05, 0.4, 0.0002),
+    Slider("pursuer_speed", "Pursuer's wheel speed", "m/s", 0.05, 0.4, 0.001),
+    Slider("pursuer_half_axle", "Pursuer's half axle", "m", 0.05, 0.5, 0.005),
+    Slider("capture_distance", "Capture distance", "m", 0.05, 0.5, 0.001),
+    Slider("collision_distance", "Obstacle's radius", "m", 0.05, 0.5, 0.005),
+    Slider("obstacle_speed", "Obstacle's speed", "m/s", 0.0, 0.1, 0.005),
+)
+"""What the page offers. `obstacle_speed` is the magnitude of the scenario's `obstacle_velocity`."""
+
+
+def sliders_for(scenario: Scenario) -> dict[str, Slider]:
+    """The sliders by name, their bounds wide enough for the scenario's own numbers."""
+    own = numbers_of(scenario)
+    wide = {}
+    for slider in SLIDERS:
+        low, high = min(slider.low, own[slider.name]), max(slider.high, own[slider.name])
+        wide[slider.name] = Slider(**{**asdict(slider), "low": low, "high": high})
+    return wide
+
+
+def numbers_of(scenario: Scenario) -> dict[str, float]:
+    """Where the sliders stand for this scenario, SI units."""
+    fields = {slider.name for slider in SLIDERS} - {"obstacle_speed"}
+    numbers = {name: plain(getattr(scenario, name)) for name in fields}
+    drift = [plain(component) for component in scenario.obstacle_velocity]
+    return {**numbers, "obstacle_speed": round(math.hypot(*drift), 6)}
+
+
+def with_numbers(scenario: Scenario, numbers: Mapping[str, float]) -> Scenario:
+    """The scenario with the sliders at `numbers`; new starts are kept clear of what has become larger."""
+    fields = {name: value for name, value in numbers.items() if name != "obstacle_speed"}
+    changed = _replaced(scenario, fields)
+    if "obstacle_speed" in numbers:
+        changed = eqx.tree_at(
+            lambda s: s.obstacle_velocity,
+            changed,
+            real(_rescaled(np.asarray(scenario.obstacle_velocity, float), numbers["obstacle_speed"])),
+        )
+    ratio = min(float(changed.evader_speed) / float(changed.pursuer_speed), 1.0)
+    tip = float(changed.capture_distance) / ratio
+    return _replaced(
+        changed,
+        {
+            "initial_separation": max(float(scenario.initial_separation), tip + _TIP_ROOM),
+            "obstacle_separation": max(
+                float(scenario.obstacle_separation), 1.5 * float(changed.collision_distance)
+            ),
+        },
+    )
+
+
+def _replaced(scenario: Scenario, fields: Mapping[str, Any]) -> Scenario:
+    names = list(fields)
+    if not names:
+        return scenario
+    return eqx.tree_at(
+        lambda s: [getattr(s, name) for name in names], scenario, [real(fields[name]) for name in names]
+    )
+
+
+def _rescaled(velocity: Any, speed: float) -> Any:
+    """`velocity` (n, 2) or (2,) turned to this speed (m/s); along +x where it was at rest."""
+    velocity = np.asarray(velocity, float)
+    length = np.hypot(velocity[..., 0], velocity[..., 1])[..., None]
+    ahead = np.zeros_like(velocity)
+    ahead[..., 0] = 1.0
+    return speed * np.where(length > 0.0, velocity / np.where(length > 0.0, length, 1.0), ahead)
+
+
+def drifts_at(velocities: Any, speed: float) -> Any:
+    """Velocities (k, 2) of obstacles, each at this speed (m/s) in the direction it had."""
+    return _rescaled(velocities, speed)
