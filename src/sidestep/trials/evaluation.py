@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.learning.records import OUTCOMES, json_safe
+from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.statistics import wilson_interval
 
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
@@ -22,7 +23,7 @@ class Evaluation:
     `times` s; `min_pursuer_clearance` and `min_obstacle_clearance` m, infinite without such a robot;
     `interventions`, `infeasible`, `invalid` control periods in which the shield did not answer with the
     nominal action, could not satisfy its rows, was given numbers that are not finite; `mean_correction`
-    over all periods and `max_correction`, m/s.
+    over all periods and `max_correction`, m/s; `map` where the shield stepped in, if it was asked for.
     """
 
     outcome: Int[np.ndarray, "episodes"]
@@ -36,6 +37,7 @@ class Evaluation:
     invalid: Int[np.ndarray, "episodes"]
     mean_correction: Float[np.ndarray, "episodes"]
     max_correction: Float[np.ndarray, "episodes"]
+    map: InterventionMap | None = None
 
     def numbers_of(self, outcome: str) -> Int[np.ndarray, "some"]:
         """Numbers of the episodes with this outcome; `rollout` with `episode_key` replays them."""

@@ -16,11 +16,13 @@ from sidestep.learning.control_step import RUNNING, control_step, decide, decisi
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, Status, as_shield, start_in_lanes
 from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.intervention_map import InterventionMap, add_periods, map_reach, no_periods
 from sidestep.trials.keys import as_key, episode_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
 from sidestep.world import Scenario, World
 
 _CHUNK_STEPS = 200
+Sums = Array | None
 
 
 class Episode(eqx.Module):
@@ -94,18 +96,24 @@ def _advance(
     key: PRNGKeyArray,
     episodes: Episode,
     decisions: Count,
-) -> Episode:
-    """Every running episode by up to `decisions` decisions; stops early when none is running."""
+    sums: Sums,
+) -> tuple[Episode, Sums]:
+    """Every running episode by up to `decisions` decisions; stops early when none is running.
+
+    `sums` of the intervention map are added to, if there are any.
+    """
 
     def period_key(number: Array, steps: Array) -> PRNGKeyArray:
         return jax.random.fold_in(start_and_pursuit(episode_key(key, number))[1], steps)
 
-    def period(episode: Episode, nominal: Array) -> Episode:
+    def period(episode: Episode, sums: Sums, nominal: Array) -> tuple[Episode, Sums]:
         keys = jax.vmap(period_key)(episode.number, episode.steps)
         running = episode.outcome == RUNNING
         world, memory, events, result, _ = control_step(
             scenario, shield, pursuer, episode.world.set_apart(~running), episode.memory, nominal, keys
         )
+        if sums is not None:
+            sums = add_periods(sums, scenario, episode.world, nominal, result, running)
         moved = Episode(
             number=episode.number,
             outcome=outcome_of(events),
@@ -121,20 +129,21 @@ def _advance(
             correction=episode.correction + result.intervention,
             max_correction=jnp.maximum(episode.max_correction, result.intervention),
         )
-        return _select(running, moved, episode)
+        return _select(running, moved, episode), sums
 
-    def decision(episode: Episode) -> Episode:
+    def decision(episode: Episode, sums: Sums) -> tuple[Episode, Sums]:
         nominal = decide(scenario, policy, episode.world)
-        hold = lambda episode, _: (period(episode, nominal), None)  # noqa: E731
-        return jax.lax.scan(hold, episode, None, length=decision_steps_of(policy))[0]
+        hold = lambda carry, _: (period(*carry, nominal), None)  # noqa: E731
+        return jax.lax.scan(hold, (episode, sums), None, length=decision_steps_of(policy))[0]
 
-    def more(carry: tuple[Count, Episode]) -> Array:
+    def more(carry: tuple[Count, Episode, Sums]) -> Array:
         return (carry[0] < decisions) & jnp.any(carry[1].outcome == RUNNING)
 
-    def advance(carry: tuple[Count, Episode]) -> tuple[Count, Episode]:
-        return carry[0] + 1, decision(carry[1])
+    def advance(carry: tuple[Count, Episode, Sums]) -> tuple[Count, Episode, Sums]:
+        return carry[0] + 1, *decision(*carry[1:])
 
-    return jax.lax.while_loop(more, advance, (jnp.zeros((), jnp.int32), episodes))[1]
+    _, episodes, sums = jax.lax.while_loop(more, advance, (jnp.zeros((), jnp.int32), episodes, sums))
+    return episodes, sums
 
 
 def _positive(name: str, value: Any) -> int:
@@ -153,6 +162,7 @@ def evaluate(
     *,
     batch: int = 256,
     progress: Callable[[int, int], None] | None = None,
+    mapped: bool = False,
 ) -> Evaluation:
     """Run `episodes` independent episodes to their ends and report what happened.
 
@@ -167,6 +177,7 @@ def evaluate(
       `(scenario, world, key) -> wheel speeds (2,)`
     - `key` a random key or a seed
     - `batch` episodes that run at once; `progress(finished, episodes)` is called between chunks
+    - `mapped` whether to sum up where the shield stepped in, as `Evaluation.map`
 
     **Raises** `ValueError` for a number that is not positive, for an unknown name and for an answer of the
     wrong shape. An action that is not finite is passed on to the shield and counted as `invalid`.
@@ -183,6 +194,7 @@ def evaluate(
     numbers = np.full(batch, RUNNING, np.int32)
     slots: Episode | None = None
     results: dict[str, np.ndarray] = {}
+    whole: Any = 0.0
     begun = finished = 0
     while finished < episodes:
         free = np.flatnonzero(numbers < 0)[: episodes - begun]
@@ -194,14 +206,19 @@ def evaluate(
             numbers[free] = fresh[free]
             begun += len(free)
         assert slots is not None
-        slots = _advance(scenario, policy, shield, pursuer, key, slots, decisions)
+        sums = no_periods() if mapped else None
+        slots, sums = _advance(scenario, policy, shield, pursuer, key, slots, decisions, sums)
+        if sums is not None:
+            # Single precision is enough for one chunk, not for a long trial.
+            whole = whole + np.asarray(sums, np.float64)
         ended = np.flatnonzero((np.asarray(slots.outcome) != RUNNING) & (numbers >= 0))
         _collect(results, slots, ended, numbers[ended], episodes)
         numbers[ended] = RUNNING
         finished += len(ended)
         if progress is not None:
             progress(finished, episodes)
-    return _evaluation(scenario, results)
+    where = InterventionMap.of_sums(float(map_reach(scenario)), whole) if mapped else None
+    return _evaluation(scenario, results, where)
 
 
 _COLLECTED = (
@@ -226,7 +243,9 @@ def _collect(
         results.setdefault(name, np.zeros(episodes, values.dtype))[numbers] = values[ended]
 
 
-def _evaluation(scenario: Scenario, results: dict[str, np.ndarray]) -> Evaluation:
+def _evaluation(
+    scenario: Scenario, results: dict[str, np.ndarray], where: InterventionMap | None
+) -> Evaluation:
     steps = results["steps"]
     return Evaluation(
         outcome=results["outcome"],
@@ -240,4 +259,5 @@ def _evaluation(scenario: Scenario, results: dict[str, np.ndarray]) -> Evaluatio
         invalid=results["invalid"],
         mean_correction=results["correction"] / steps,
         max_correction=results["max_correction"],
+        map=where,
     )
