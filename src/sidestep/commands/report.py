@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sidestep.commands.common import CountBar
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -19,23 +21,82 @@ class Report:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]|LOG")]
     """Run folders, or the folder of a reproduction; or an MCAP log of one episode."""
     out: Path | None = None
-    """HTML file to write; report.html in the first folder, or beside the log, by default."""
+    """HTML file to write; report.html in the first folder, or beside the log, by default. Its figures go into
+    figures/ beside it, or NAME-figures/ for NAME.html."""
+    episodes: int = 100
+    """Random episodes to run with a policy whose folder holds no record of any: for the histograms, the map
+    of interventions and the worst episodes. They are kept in the folder. 0 for none."""
 
 
 def run(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
-    from sidestep.learning.records import open_run
     from sidestep.views import write_report
 
     if any(path.suffix == ".mcap" for path in command.runs):
         return _report_log(command, console)
-    folders: list[Path] = []
-    for folder in command.runs:
-        study = open_run(folder).get("study")
-        folders += [folder] if study is None else [folder / shield for shield in study]
+    if command.episodes < 0:
+        raise ValueError(f"episodes = {command.episodes}: it must be 0 or more")
+    folders = _run_folders(command.runs, console)
     path = command.out or command.runs[0] / "report.html"
-    console.print(f"Report with figures: {write_report(folders, path)}")
+    _refuse_other_files(path)
+    for folder in folders:
+        _look_closer(folder, command.episodes, console)
+    figures = None if path.stem == "report" else path.with_name(f"{path.stem}-figures")
+    written = write_report(folders, path, figures=figures)
+    console.print(f"Report with figures: {written}", highlight=False)
     return 0
+
+
+def _run_folders(paths: tuple[Path, ...], console: Console) -> list[Path]:
+    """The run folders, those of a reproduction one by one. A run counts once."""
+    from sidestep.learning.records import RunError, read_json
+
+    folders: list[Path] = []
+    for path in paths:
+        if not (path / "config.json").is_file():
+            raise RunError(f"{path} holds no run (no config.json)")
+        study = read_json(path / "config.json").get("study")
+        begun = [path] if study is None else [path / shield for shield in study]
+        missing = [folder for folder in begun if not (folder / "config.json").is_file()]
+        if len(missing) == len(begun):
+            raise RunError(f"{path} holds no run yet: its study has not begun to train")
+        if missing:
+            names = ", ".join(folder.name for folder in missing)
+            console.print(f"Not trained yet in {path}: {names}", highlight=False)
+        folders += [folder for folder in begun if folder not in missing]
+    places = [folder.resolve() for folder in folders]
+    for folder, place in zip(folders, places, strict=True):
+        if places.count(place) > 1:
+            raise RunError(f"{folder} is given twice; its episodes would count double")
+    return folders
+
+
+def _refuse_other_files(path: Path) -> None:
+    """A report may be written anew, but nothing else written over."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give --out the name of an HTML file")
+    if path.is_file():
+        with path.open("rb") as file:
+            if b"<title>sidestep" not in file.read(1000):
+                raise ValueError(f"{path} exists already and is no report; give --out another name")
+
+
+def _look_closer(folder: Path, episodes: int, console: Console) -> None:
+    """Run random episodes with the policy of a run whose folder has no record of any, and keep them there."""
+    from sidestep.learning.records import read_json
+    from sidestep.trials.survey import EPISODES_FILE, save_survey, survey_run
+
+    if not episodes or (folder / EPISODES_FILE).exists() or not (folder / "policy.npz").exists():
+        return
+    config = read_json(folder / "config.json")
+    try:
+        with CountBar(console, f"{config['shield']} shield, {episodes} episodes") as show:
+            survey = survey_run(folder, episodes, progress=show)
+    except (KeyError, ValueError) as error:
+        # A shield or pursuer of the user's own is known by its name alone, which brings nothing back.
+        console.print(f"No episodes run for {folder}: {error}", highlight=False)
+        return
+    save_survey(folder, survey)
 
 
 def _report_log(command: Report, console: Console) -> int:
@@ -47,6 +108,7 @@ def _report_log(command: Report, console: Console) -> int:
         raise ValueError("a report is of runs or of one log")
     log = load_log(path)
     out = command.out or path.with_suffix(".html")
+    _refuse_other_files(out)
     written = write_episode_report(
         log.scenario, log.trajectory, out, title=f"Log {path.stem}", about=log.about, notes=log.rebuilt
     )

@@ -2,6 +2,7 @@
 
 from sidestep.trials.captures import Capture, count_causes, examine_captures, explain_capture
 from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.keys import episode_key
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import as_policy
@@ -12,11 +13,15 @@ from sidestep.trials.statistics import (
     wilson_interval,
     zero_event_bound,
 )
+from sidestep.trials.survey import Survey, WorstEpisode, load_survey, save_survey, survey_run, take_survey
 
 __all__ = [
     "Capture",
     "Evaluation",
+    "InterventionMap",
+    "Survey",
     "Trajectory",
+    "WorstEpisode",
     "as_policy",
     "count_causes",
     "episode_key",
@@ -24,10 +29,14 @@ __all__ = [
     "examine_captures",
     "explain_capture",
     "interquartile_mean",
+    "load_survey",
     "load_trajectory",
     "rollout",
+    "save_survey",
     "save_trajectory",
     "stratified_bootstrap",
+    "survey_run",
+    "take_survey",
     "wilson_interval",
     "zero_event_bound",
 ]

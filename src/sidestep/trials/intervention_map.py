@@ -1,4 +1,4 @@
-"""Where the shield stepped in: sums over control periods, by the evader's place in the nearest pursuer's frame."""
+"""Where the shield stepped in: sums over control periods, by the evader's place as a pursuer sees it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sidestep.safety import ShieldResult, Status
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
 
-CELLS = 80
-"""Cells along each axis of the map."""
-_REACH = 4.0
+CELLS = 75
+"""Cells along each axis of the map; odd, so that the pursuer's axis has cells of its own: much happens there."""
+_REACH = 2.5
 _NAMES = ("periods", "corrected", "infeasible", "correction", "ahead", "left")
 
 
 def map_reach(scenario: Scenario) -> Float[Array, ""]:
-    """How far (m) the map reaches ahead, behind, left and right of the pursuer: four capture distances."""
+    """How far (m) the map reaches ahead, behind, left and right of the pursuer: 2.5 capture distances."""
     return jnp.asarray(_REACH * scenario.capture_distance)
 
 

@@ -17,6 +17,11 @@ def episode_key(key: PRNGKeyArray | int, number: int | Int[Array, ""]) -> PRNGKe
     return jax.random.fold_in(as_key(key), number)
 
 
+def evaluation_seed(seed: int) -> int:
+    """Seed of the episodes on which a run with this seed is measured: not those it was trained on."""
+    return seed + 1_000_000
+
+
 def start_and_pursuit(key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArray]:
     """Keys of one episode's start and of its pursuers, which fold in the number of the control period."""
     start_key, pursuit_key = jax.random.split(key)

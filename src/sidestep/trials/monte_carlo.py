@@ -133,7 +133,7 @@ def _advance(
 
     def decision(episode: Episode, sums: Sums) -> tuple[Episode, Sums]:
         nominal = decide(scenario, policy, episode.world)
-        hold = lambda carry, _: (period(*carry, nominal), None)  # noqa: E731
+        hold = lambda carry, _: (period(carry[0], carry[1], nominal), None)  # noqa: E731
         return jax.lax.scan(hold, (episode, sums), None, length=decision_steps_of(policy))[0]
 
     def more(carry: tuple[Count, Episode, Sums]) -> Array:

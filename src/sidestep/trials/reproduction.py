@@ -15,9 +15,11 @@ from sidestep.learning import TrainingOptions, load_policy, make_options, option
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import SHIELDS, Status, make_shield
 from sidestep.trials.captures import examine_captures
+from sidestep.trials.keys import evaluation_seed
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import GOAL_SEEKING
 from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
+from sidestep.trials.survey import save_survey, take_survey
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
 PAPER: dict[str, Any] = {
@@ -154,7 +156,7 @@ def reproduce(
     else:
         records.create_run(out, config)
 
-    evaluation_key = seed + 1_000_000
+    evaluation_key = evaluation_seed(seed)
     studies = []
     for shield in shields:
         folder = out / shield
@@ -171,15 +173,21 @@ def reproduce(
 
         def measure(policy: Any, label: str, shield: str = shield, folder: Path = folder) -> dict[str, Any]:
             with count_progress(f"{shield} shield, {label}") as show:
-                result = evaluate(
+                if policy is GOAL_SEEKING:
+                    return evaluate(
+                        scenario, policy, shield, pursuer, evaluation_episodes, evaluation_key, progress=show
+                    ).to_dict()
+                survey = take_survey(
                     scenario, policy, shield, pursuer, evaluation_episodes, evaluation_key, progress=show
                 )
-            figures = result.to_dict()
-            if policy is not GOAL_SEEKING:
-                causes, example = examine_captures(scenario, policy, shield, pursuer, result, evaluation_key)
-                figures["capture_causes"] = causes
-                if example is not None:
-                    save_trajectory(folder / "capture.npz", example)
+            save_survey(folder, survey)
+            figures = survey.evaluation.to_dict()
+            causes, example = examine_captures(
+                scenario, policy, shield, pursuer, survey.evaluation, evaluation_key
+            )
+            figures["capture_causes"] = causes
+            if example is not None:
+                save_trajectory(folder / "capture.npz", example)
             return figures
 
         def play(policy: Any, shield: str = shield) -> Trajectory:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import base64
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 
 def data_uri(png: Path) -> str:
-    """A PNG as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode()
+    """A PNG as a data URI, in 256 colours, which is a third of the size: a report is mailed about."""
+    buffer = BytesIO()
+    with Image.open(png) as picture:
+        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def shown_number(value: float | int | None, digits: int = 1, unit: str = "") -> str:

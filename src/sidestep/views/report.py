@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,12 @@ import sidestep
 from sidestep.learning.records import converged_episode, write_bytes
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import Status
-from sidestep.trials import Capture, Trajectory, explain_capture
+from sidestep.trials import Capture, InterventionMap, Trajectory, explain_capture
 from sidestep.views.capture_figure import capture_figure
+from sidestep.views.clearance_figure import clearance_figure
 from sidestep.views.html import data_uri, shown_number, shown_value
+from sidestep.views.intervention_figure import intervention_figure
+from sidestep.views.replay import AFTER, BEFORE, episodes_for_page, player
 from sidestep.views.runs import Run, by_shield, load_run
 from sidestep.views.style import OUTCOME_WORDS, shield_colour, shield_words
 from sidestep.views.training_figures import (
@@ -32,6 +36,8 @@ from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
 from sidestep.world import Scenario
 
 _PACKAGES = ("jax", "equinox", "optax", "numpy", "matplotlib")
+_MOST_REPLAYS = 4
+"""Episodes to replay per shield."""
 _CAUSE_WORDS = {
     "reversing": "the pursuer drove backwards, which the row takes for leaving",
     "head-on": "the pursuer came straight on, and no velocity satisfied the row",
@@ -104,6 +110,10 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         if evaluations
         else None,
         "scenes": [_scene(run.scenario, shield, scene, folder) for shield, (run, scene) in scenes.items()],
+        "clearances": _clearance_section(groups, scenario, folder),
+        "map": _map_section(groups, scenario, folder),
+        "replay": _replay_section(groups),
+        "differences": _differences(runs),
         "capture": _capture_section(groups, folder),
         "game": _game_numbers(scenario),
         "joint": "joint" in groups,
@@ -243,6 +253,101 @@ def _scene(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> 
         "seconds": scene.length * float(scenario.control_period),
         "facts": facts,
     }
+
+
+def _clearance_section(
+    groups: Mapping[str, Sequence[Run]], scenario: Scenario, folder: Path
+) -> dict[str, Any] | None:
+    """Histograms of the episodes after training, or of those in training where a run has no others."""
+    surveyed = all(run.survey is not None for group in groups.values() for run in group)
+
+    def of(run: Run, hazard: str) -> np.ndarray:
+        if surveyed and run.survey is not None:
+            return np.asarray(getattr(run.survey.evaluation, f"min_{hazard}_clearance"))
+        values = [episode.get(f"min_{hazard}_clearance") for episode in run.metrics]
+        return np.array([np.inf if value is None else float(value) for value in values])
+
+    clearances = {
+        shield: (
+            np.concatenate([of(run, "pursuer") for run in group]),
+            np.concatenate([of(run, "obstacle") for run in group]),
+        )
+        for shield, group in groups.items()
+    }
+    if not any(np.any(np.isfinite(values)) for pair in clearances.values() for values in pair):
+        return None
+    written = clearance_figure(
+        clearances,
+        folder / "clearances",
+        capture_distance=float(scenario.capture_distance),
+        collision_distance=float(scenario.collision_distance),
+    )
+    return {
+        "figure": _figure(written),
+        "surveyed": surveyed,
+        "episodes": {shield: len(pair[0]) for shield, pair in clearances.items()},
+    }
+
+
+def _map_section(
+    groups: Mapping[str, Sequence[Run]], scenario: Scenario, folder: Path
+) -> dict[str, Any] | None:
+    """Where each shield stepped in, over the episodes after training; None without a shield that did."""
+    maps: dict[str, InterventionMap] = {}
+    episodes: dict[str, int] = {}
+    for shield, group in groups.items():
+        for run in group:
+            if run.survey is None or run.survey.evaluation.map is None:
+                continue
+            found = run.survey.evaluation.map
+            # Runs with other capture distances have maps of another region.
+            if shield not in maps:
+                maps[shield] = found
+            elif maps[shield].reach == found.reach:
+                maps[shield] += found
+            else:
+                continue
+            episodes[shield] = episodes.get(shield, 0) + run.survey.evaluation.episodes
+    maps = {shield: one for shield, one in maps.items() if one.corrected.any()}
+    if not maps:
+        return None
+    return {
+        "figure": _figure(intervention_figure(scenario, maps, folder / "interventions")),
+        "episodes": {shield: episodes[shield] for shield in maps},
+        "periods": {shield: int(one.periods.sum()) + one.outside for shield, one in maps.items()},
+        "outside": {shield: one.outside for shield, one in maps.items()},
+        "reach": next(iter(maps.values())).reach,
+    }
+
+
+def _replay_section(groups: Mapping[str, Sequence[Run]]) -> dict[str, Any] | None:
+    """The worst episodes of each shield, by turns from its runs, for the player."""
+    shown: list[dict[str, Any]] = []
+    for shield, group in groups.items():
+        turns = zip_longest(*[run.survey.worst if run.survey else () for run in group])
+        pairs = [
+            (run, one) for turn in turns for run, one in zip(group, turn, strict=True) if one is not None
+        ]
+        for run, episode in pairs[:_MOST_REPLAYS]:
+            words = shield_words(shield) + (f", seed {run.seed}" if len(group) > 1 else "")
+            for packed in episodes_for_page(run.scenario, shield, [episode]):
+                shown.append(packed | {"group": words[:1].upper() + words[1:]})
+    if not shown:
+        return None
+    shown.sort(key=lambda episode: list(groups).index(episode["shield"]))
+    return {**player(shown), "before": BEFORE, "after": AFTER, "cut": any(one["cut"] for one in shown)}
+
+
+def _differences(runs: Sequence[Run]) -> list[tuple[str, list[str]]]:
+    """Scenario fields in which these runs differ, with their values: their figures are then of two worlds."""
+    scenarios = [run.config["scenario"] for run in runs]
+    fields = {name for scenario in scenarios for name in scenario if name != "name"}
+    found = []
+    for name in sorted(fields):
+        values = list(dict.fromkeys(shown_value(scenario.get(name)) for scenario in scenarios))
+        if len(values) > 1:
+            found.append((name.replace("_", " "), values))
+    return found
 
 
 def _capture_section(groups: Mapping[str, Sequence[Run]], folder: Path) -> dict[str, Any] | None:

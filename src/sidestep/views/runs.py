@@ -9,7 +9,7 @@ from typing import Any
 
 from sidestep.learning.records import RunError, read_json, read_metrics, summarise
 from sidestep.safety.catalogue import SHIELDS
-from sidestep.trials import Trajectory, load_trajectory
+from sidestep.trials import Survey, Trajectory, load_survey, load_trajectory
 from sidestep.world import Scenario, load_scenario
 
 EVALUATION_FILE = "evaluation.json"
@@ -26,7 +26,8 @@ class Run:
     **Attributes:** `config`, `metrics`, `summary` as on disk; `evaluation` what `Evaluation.to_dict` gave
     after training; `scene` the paper's test scene with the trained policy; `capture` an episode that the
     shield lost, if one is shown; `untrained_evaluation` and `untrained_scene` the same with the untrained
-    policy that heads straight for the target. All but `config` and `metrics` may be missing.
+    policy that heads straight for the target; `survey` the evaluation episode by episode. All but `config`
+    and `metrics` may be missing.
     """
 
     config: Mapping[str, Any]
@@ -37,6 +38,7 @@ class Run:
     capture: Trajectory | None = None
     untrained_evaluation: Mapping[str, Any] | None = None
     untrained_scene: Trajectory | None = None
+    survey: Survey | None = None
     folder: Path | None = None
 
     @property
@@ -85,6 +87,7 @@ def load_run(folder: str | Path) -> Run:
         capture=episode(CAPTURE_FILE),
         untrained_evaluation=figures(UNTRAINED_EVALUATION_FILE),
         untrained_scene=episode(UNTRAINED_SCENE_FILE),
+        survey=load_survey(folder),
         folder=folder,
     )
 

@@ -1,0 +1,186 @@
+"""What an evaluation leaves in a run folder for those who look closer: every episode's figures, where the
+shield stepped in, and the worst episodes as recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sidestep.learning import load_policy
+from sidestep.learning.records import OUTCOMES, RunError, open_run, write_bytes
+from sidestep.trials.evaluation import Evaluation
+from sidestep.trials.intervention_map import InterventionMap
+from sidestep.trials.keys import episode_key, evaluation_seed
+from sidestep.trials.monte_carlo import evaluate
+from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
+from sidestep.world import Scenario, load_scenario
+
+EPISODES_FILE = "episodes.npz"
+WORST_FOLDER = "worst"
+HAZARDS = ("capture", "collision")
+_MAP = "map."
+
+
+@dataclass(frozen=True)
+class WorstEpisode:
+    """One of the episodes that came nearest to capture or collision, or beyond.
+
+    **Attributes:** `number` in the evaluation; `hazard` which of `HAZARDS` it was chosen for.
+    """
+
+    number: int
+    hazard: str
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True)
+class Survey:
+    """An evaluation episode by episode. `seed` it was measured with: `episode_key(seed, i)` is episode i."""
+
+    evaluation: Evaluation
+    seed: int
+    worst: tuple[WorstEpisode, ...] = ()
+
+
+def worst_numbers(evaluation: Evaluation) -> list[tuple[int, str]]:
+    """All episodes, the worst first: by turns the next nearest to capture and the next nearest to collision.
+
+    Hazards that no robot is there for are left out.
+    """
+    orders = [
+        [(int(number), hazard) for number in np.argsort(clearances, kind="stable")]
+        for hazard, clearances in (
+            ("capture", evaluation.min_pursuer_clearance),
+            ("collision", evaluation.min_obstacle_clearance),
+        )
+        if np.any(np.isfinite(clearances))
+    ]
+    found: dict[int, str] = {}
+    for turn in zip(*orders, strict=True):
+        for number, hazard in turn:
+            found.setdefault(number, hazard)
+    return list(found.items())
+
+
+def record_worst(
+    scenario: Scenario,
+    policy: Any,
+    shield: Any,
+    pursuer: Any,
+    evaluation: Evaluation,
+    seed: int,
+    *,
+    most: int = 4,
+) -> tuple[WorstEpisode, ...]:
+    """Run the worst episodes of an evaluation again, `most` of them.
+
+    **Arguments:** those that `evaluate` was called with.
+    """
+    found = []
+    # Rounding may differ between one episode and a batch, and an episode near the edge end otherwise.
+    for number, hazard in worst_numbers(evaluation)[: 2 * most]:
+        if len(found) == most:
+            break
+        trajectory = rollout(scenario, policy, shield, pursuer, episode_key(seed, number))
+        if trajectory.outcome == OUTCOMES[evaluation.outcome[number]]:
+            found.append(WorstEpisode(number, hazard, trajectory))
+    return tuple(found)
+
+
+def take_survey(
+    scenario: Scenario,
+    policy: Any,
+    shield: Any,
+    pursuer: Any,
+    episodes: int,
+    seed: int,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Survey:
+    """Evaluate and look closer. Arguments and errors are those of `evaluate`."""
+    evaluation = evaluate(
+        scenario, policy, shield, pursuer, episodes, seed, batch=min(episodes, 256), mapped=True,
+        progress=progress,
+    )  # fmt: skip
+    return Survey(evaluation, seed, record_worst(scenario, policy, shield, pursuer, evaluation, seed))
+
+
+def survey_run(
+    folder: str | Path, episodes: int, *, progress: Callable[[int, int], None] | None = None
+) -> Survey:
+    """A survey of a run's policy in its own scenario, under its own shield, against its own pursuer.
+
+    The episodes are the first ones of those on which `reproduce` measures a run with this seed.
+
+    **Raises** `RunError` when the folder holds no run or no policy yet, `ValueError` when its shield or
+    pursuer is none of ours.
+    """
+    config = open_run(folder)
+    scenario = load_scenario("paper", **config["scenario"])
+    policy = load_policy(folder)
+    seed = evaluation_seed(int(config["seed"]))
+    return take_survey(
+        scenario, policy, config["shield"], config["pursuer"], episodes, seed, progress=progress
+    )
+
+
+def save_survey(folder: str | Path, survey: Survey) -> None:
+    """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all."""
+    folder = Path(folder)
+    if survey.worst:
+        (folder / WORST_FOLDER).mkdir(exist_ok=True)
+    for episode in survey.worst:
+        save_trajectory(_worst_path(folder, episode.number), episode.trajectory)
+    arrays: dict[str, Any] = {
+        entry.name: getattr(survey.evaluation, entry.name)
+        for entry in dataclasses.fields(Evaluation)
+        if entry.name != "map"
+    }
+    if survey.evaluation.map is not None:
+        arrays |= {_MAP + name: values for name, values in survey.evaluation.map.to_arrays().items()}
+    arrays |= {
+        "seed": np.asarray(survey.seed),
+        "worst_numbers": np.array([episode.number for episode in survey.worst], dtype=int),
+        "worst_hazards": np.array([HAZARDS.index(episode.hazard) for episode in survey.worst], dtype=int),
+    }
+    buffer = BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_bytes(folder / EPISODES_FILE, buffer.getvalue())
+
+
+def load_survey(folder: str | Path) -> Survey | None:
+    """What `save_survey` wrote; None for a folder without it, such as one from before there were surveys.
+
+    **Raises** `RunError` when the file is damaged.
+    """
+    folder = Path(folder)
+    path = folder / EPISODES_FILE
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        where = {name.removeprefix(_MAP): arrays.pop(name) for name in list(arrays) if name.startswith(_MAP)}
+        seed = int(arrays.pop("seed"))
+        numbers, hazards = arrays.pop("worst_numbers"), arrays.pop("worst_hazards")
+        evaluation = Evaluation(**arrays, map=InterventionMap.from_arrays(where) if where else None)
+        worst = tuple(
+            WorstEpisode(int(number), HAZARDS[hazard], load_trajectory(_worst_path(folder, int(number))))
+            for number, hazard in zip(numbers, hazards, strict=True)
+            if _worst_path(folder, int(number)).is_file()
+        )
+    except (KeyError, TypeError, ValueError, EOFError, OSError) as error:
+        raise RunError(
+            f"{path} is not readable ({error}); delete it to have the episodes run again"
+        ) from error
+    return Survey(evaluation, seed, worst)
+
+
+def _worst_path(folder: Path, number: int) -> Path:
+    return folder / WORST_FOLDER / f"episode-{number}.npz"

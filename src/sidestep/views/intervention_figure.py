@@ -1,0 +1,157 @@
+"""Where the shield steps in: the evader's places in the pursuer's frame, with the sets that it is about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.patches import Arc, Circle, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+
+from sidestep.trials import InterventionMap
+from sidestep.views.scene import capture_set_outline, correction_colours
+from sidestep.views.style import (
+    INK,
+    PURSUER,
+    WIDTH,
+    house_style,
+    new_figure,
+    panel_titles,
+    save,
+    shield_words,
+)
+from sidestep.world import Scenario
+from sidestep.world.capture_geometry import capture_set_distance
+
+_FEWEST = 5
+"""Cells visited in fewer periods are left white: a share of three periods says nothing."""
+_LEVELS = (0.05, 0.1, 0.2, 0.3)
+_ARROWS = 15
+_HALO = [withStroke(linewidth=2.0, foreground="white")]
+_PURSUIT_SHIELDS = ("game", "joint")
+
+
+def intervention_figure(
+    scenario: Scenario, maps: Mapping[str, InterventionMap], path: str | Path
+) -> tuple[Path, Path]:
+    """Above, the share of control periods in which the shield changed the velocity, by where the evader was
+    in the nearest pursuer's frame; below, by how much on average, arrows for the direction.
+
+    A column per shield. Drawn over it: the capture circle, its usable part (thick), the capture set K
+    (dashed), the wheels of the pursuer, which heads to the right, and level sets of the barrier that the
+    shield keeps. Writes PNG and PDF.
+    """
+    names = list(maps)
+    columns = max(len(names), 1)
+    # One or two panels at full width would be higher than a page.
+    side = min((WIDTH - 1.2) / columns, 2.4)
+    with house_style():
+        figure = new_figure(min(WIDTH, side * columns + 1.2), 2 * side + 0.75)
+        grid = figure.subplots(2, columns, sharex=True, sharey=True, squeeze=False)
+        bars = (
+            (_share_colours(), Normalize(0.0, 100.0), "periods corrected, %"),
+            (
+                correction_colours(),
+                Normalize(0.0, 2.0 * float(scenario.evader_speed)),
+                "mean correction, m/s",
+            ),
+        )
+        for column, name in enumerate(names):
+            one = maps[name]
+            visited = one.periods >= _FEWEST
+            periods = np.maximum(one.periods, 1)
+            measures = (100.0 * one.corrected / periods, one.correction / periods)
+            for row, (values, (colours, norm, _)) in enumerate(zip(measures, bars, strict=True)):
+                axes = grid[row, column]
+                extent = (-one.reach, one.reach, -one.reach, one.reach)
+                axes.imshow(
+                    np.where(visited, values, np.nan), origin="lower", extent=extent, cmap=colours, norm=norm,
+                    interpolation="nearest", zorder=1,
+                )  # fmt: skip
+                _draw_sets(axes, scenario, one.reach, pursuit=name in _PURSUIT_SHIELDS)
+            _draw_directions(grid[1, column], one)
+        for row, (colours, norm, words) in enumerate(bars):
+            bar = figure.colorbar(
+                ScalarMappable(norm, colours), ax=list(grid[row]), shrink=0.85, aspect=22, pad=0.015
+            )
+            bar.set_label(words)
+            bar.outline.set_visible(False)  # type: ignore[operator]
+            grid[row, 0].set_ylabel("to its left, m")
+        for axes in grid[1]:
+            axes.set_xlabel("ahead of the pursuer, m")
+        words = [shield_words(name) for name in names] or [""]
+        panel_titles(list(grid[0]), [word[:1].upper() + word[1:] for word in words])
+        return save(figure, path)
+
+
+def _share_colours() -> Colormap:
+    """From pale for never to dark for always; nothing white, which is for places never visited."""
+    whole = matplotlib.colormaps["YlGnBu"]
+    return LinearSegmentedColormap.from_list("share", whole(np.linspace(0.06, 0.92, 128)))
+
+
+def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -> None:
+    radius, usable = float(scenario.capture_distance), float(scenario.usable_angle)
+    half_axle = float(scenario.pursuer_half_axle)
+    line = np.linspace(-reach, reach, 161)
+    grid = np.stack(np.meshgrid(line, line))
+    angle = scenario.usable_angle if pursuit else 0.0 * scenario.usable_angle
+    heights = np.asarray(capture_set_distance(grid, angle, scenario.capture_distance))
+    levels = axes.contour(
+        line, line, heights, levels=list(_LEVELS), colors="#555555", linewidths=0.6, zorder=3
+    )
+    labels = axes.clabel(levels, fmt="%g", fontsize=5.5, inline_spacing=1)
+    for label in labels:
+        label.set_rotation(0)
+    axes.add_patch(Circle((0, 0), radius, facecolor="white", edgecolor=PURSUER, linewidth=0.8, zorder=4))
+    outline = capture_set_outline(scenario)
+    axes.plot(*outline.T, color=PURSUER, linewidth=1.0, linestyle=(0, (3, 2)), zorder=5, path_effects=_HALO)
+    for towards in (0.0, 180.0):
+        degrees = np.rad2deg(usable)
+        axes.add_patch(
+            Arc((0, 0), 2 * radius, 2 * radius, angle=towards, theta1=-degrees, theta2=degrees, color=PURSUER,
+                linewidth=2.2, zorder=6)
+        )  # fmt: skip
+    for wheel in (-half_axle, half_axle):
+        place = (-0.3 * half_axle, wheel - 0.08 * half_axle)
+        axes.add_patch(
+            Rectangle(place, 0.6 * half_axle, 0.16 * half_axle, facecolor=INK, linewidth=0, zorder=6)
+        )
+    size = 0.55 * radius
+    shape = size * np.array([[0.75, 0.0], [-0.5, 0.5], [-0.25, 0.0], [-0.5, -0.5]])
+    axes.add_patch(Polygon(shape, facecolor=PURSUER, edgecolor="white", linewidth=0.5, zorder=7))
+    axes.set_aspect("equal")
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+
+
+def _blocks(values: Float[np.ndarray, "cells cells"]) -> Float[np.ndarray, "arrows arrows"]:
+    """Sums over square blocks of cells."""
+    width = len(values) // _ARROWS
+    cut = values[: width * _ARROWS, : width * _ARROWS]
+    return cut.reshape(_ARROWS, width, _ARROWS, width).sum(axis=(1, 3))
+
+
+def _draw_directions(axes: Axes, one: InterventionMap) -> None:
+    """Arrows along the mean correction, for blocks of cells in which there is one to speak of."""
+    periods = _blocks(one.periods)
+    weight = np.maximum(periods, 1)
+    ahead, left = _blocks(one.ahead) / weight, _blocks(one.left) / weight
+    size = np.hypot(ahead, left)
+    shown = (periods >= 4 * _FEWEST) & (size > 0.1 * np.max(size, initial=0.0)) & (size > 1e-6)
+    if not np.any(shown):
+        return
+    step = 2.0 * one.reach / _ARROWS
+    middle = -one.reach + step * (np.arange(_ARROWS) + 0.5)
+    x, y = np.meshgrid(middle, middle)
+    axes.quiver(
+        x[shown], y[shown], ahead[shown], left[shown], angles="xy", scale_units="xy", pivot="mid",
+        scale=float(np.max(size)) / (1.1 * step), color=INK, width=0.006, headwidth=4.5, headlength=4.5,
+        headaxislength=4.0, zorder=3.5, path_effects=[withStroke(linewidth=1.2, foreground="white")],
+    )  # fmt: skip
