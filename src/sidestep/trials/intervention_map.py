@@ -15,7 +15,7 @@ from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
 
 CELLS = 75
-"""Cells along each axis of the map; odd, so that the pursuer's axis has cells of its own: much happens there."""
+"""Cells along each axis; odd, so that the axis of the pursuer, where much happens, has cells of its own."""
 _REACH = 2.5
 _NAMES = ("periods", "corrected", "infeasible", "correction", "ahead", "left")
 

@@ -58,6 +58,7 @@ def capture_figure(scenario: Scenario, trajectory: Trajectory, path: str | Path)
         panel_titles(
             [scene, plane, speeds],
             ["The last seconds", f"What it could do at {when:.1f} s", "Speed away from the pursuer"],
+            in_caption=True,
         )
         return save(figure, path)
 

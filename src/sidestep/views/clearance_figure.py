@@ -80,7 +80,7 @@ def clearance_figure(
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_locator(NullLocator())
             axes.yaxis.set_minor_formatter(NullFormatter())
-        panel_titles(list(grid[0]), [_HAZARDS[index][1] for index in hazards] or [""])
+        panel_titles(list(grid[0]), [_HAZARDS[index][1] for index in hazards] or [""], in_caption=True)
         figure.align_ylabels(grid[:, 0])
         return save(figure, path)
 
@@ -116,7 +116,7 @@ def _draw(
         f"{contacts} {_HAZARDS[index][0]}", (left, 1.0), xycoords=("data", "axes fraction"),
         fontsize=7, color=lost if contacts else INK, ha="left", va="top", weight="bold" if contacts else None,
     )  # fmt: skip
-    axes.axvline(0.0, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.axvline(0.0, ymax=0.84, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_xlim(left - 0.4 * width, places[-1])
     ticks = [tick for tick in _TICKS if tick <= edges[-1]]
     axes.set_xticks([float(np.sqrt(tick)) for tick in ticks], [f"{tick:g}" for tick in ticks])

@@ -17,6 +17,7 @@ from matplotlib.patheffects import withStroke
 from sidestep.trials import InterventionMap
 from sidestep.views.scene import capture_set_outline, correction_colours
 from sidestep.views.style import (
+    COLUMN,
     INK,
     PURSUER,
     WIDTH,
@@ -33,6 +34,8 @@ _FEWEST = 5
 """Cells visited in fewer periods are left white: a share of three periods says nothing."""
 _LEVELS = (0.05, 0.1, 0.2, 0.3)
 _ARROWS = 15
+_LEAST_SIDE = 1.3
+"""Inches; with more shields than fit a page at this size the figure becomes wider."""
 _HALO = [withStroke(linewidth=2.0, foreground="white")]
 _PURSUIT_SHIELDS = ("game", "joint")
 
@@ -50,9 +53,9 @@ def intervention_figure(
     names = list(maps)
     columns = max(len(names), 1)
     # One or two panels at full width would be higher than a page.
-    side = min((WIDTH - 1.2) / columns, 2.4)
+    side = float(np.clip((WIDTH - 1.2) / columns, _LEAST_SIDE, COLUMN - 1.2))
     with house_style():
-        figure = new_figure(min(WIDTH, side * columns + 1.2), 2 * side + 0.75)
+        figure = new_figure(side * columns + 1.2, 2 * side + 0.75)
         grid = figure.subplots(2, columns, sharex=True, sharey=True, squeeze=False)
         bars = (
             (_share_colours(), Normalize(0.0, 100.0), "periods corrected, %"),
@@ -106,7 +109,7 @@ def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -
     levels = axes.contour(
         line, line, heights, levels=list(_LEVELS), colors="#555555", linewidths=0.6, zorder=3
     )
-    labels = axes.clabel(levels, fmt="%g", fontsize=5.5, inline_spacing=1)
+    labels = axes.clabel(levels, _LEVELS[1:], fmt="%g", fontsize=5.5, inline_spacing=1)
     for label in labels:
         label.set_rotation(0)
     axes.add_patch(Circle((0, 0), radius, facecolor="white", edgecolor=PURSUER, linewidth=0.8, zorder=4))

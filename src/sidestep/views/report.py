@@ -23,7 +23,7 @@ from sidestep.views.html import data_uri, shown_number, shown_value
 from sidestep.views.intervention_figure import intervention_figure
 from sidestep.views.replay import AFTER, BEFORE, episodes_for_page, player
 from sidestep.views.runs import Run, by_shield, load_run
-from sidestep.views.style import OUTCOME_WORDS, shield_colour, shield_words
+from sidestep.views.style import COLUMN, OUTCOME_WORDS, shield_colour, shield_words
 from sidestep.views.training_figures import (
     PAPER_CONVERGED,
     outcome_figure,
@@ -96,7 +96,7 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "comparison": _comparison(
             groups, {shield: scene for shield, (_, scene) in scenes.items()}, untrained_scenes
         ),
-        "reward": _figure(reward_figure(runs, folder / "reward")),
+        "reward": _reward(runs, folder),
         "shows_episodes": shows_episodes(runs),
         "several_seeds": any(len(group) > 1 for group in groups.values()),
         "evaluations": evaluations,
@@ -141,6 +141,12 @@ def _first_of(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, tupl
 def _figure(written: tuple[Path, Path]) -> str:
     """A PNG as a data URI."""
     return data_uri(written[0])
+
+
+def _reward(runs: Sequence[Run], folder: Path) -> str:
+    """The page's reward figure; beside it, the same for one column of a paper."""
+    reward_figure(runs, folder / "reward-column", width=COLUMN)
+    return _figure(reward_figure(runs, folder / "reward"))
 
 
 def _percent(value: float | int | None, digits: int = 1) -> str:

@@ -47,8 +47,9 @@ _SHIELD_DASHES: dict[str, Any] = {
 }
 _OTHERS = (PURPLE, SKY, VERMILION, BLACK)
 
-WIDTH = 7.0
-"""Full text width of a two-column page, inches."""
+WIDTH, COLUMN = 7.16, 3.5
+"""Widths of a two-column page's text and of one of its columns, inches."""
+_CAPTION = "belongs into the caption"
 _DPI = 200
 _MOST_BYTES = 300_000
 
@@ -126,16 +127,21 @@ def light_grid(axes: Axes, axis: Any = "both") -> None:
     axes.grid(True, axis=axis, color="#E6E6E6", linewidth=0.6)
 
 
-def panel_titles(axes: Sequence[Axes], titles: Sequence[str]) -> None:
-    """Titles with the letters a, b, ... that captions refer to; no letter for a single panel."""
+def panel_titles(axes: Sequence[Axes], titles: Sequence[str], *, in_caption: bool = False) -> None:
+    """Titles with the letters a, b, ... that captions refer to; no letter for a single panel.
+
+    With `in_caption` the PDF, which is for papers, keeps the letters alone: the words are for its caption.
+    """
     for index, (one, title) in enumerate(zip(axes, titles, strict=True)):
-        one.set_title(title if len(axes) == 1 else f"{chr(ord('a') + index)}   {title}")
+        text = one.set_title(title if len(axes) == 1 else f"{chr(ord('a') + index)}   {title}")
+        text.set_gid(_CAPTION if in_caption else None)
 
 
 def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
     """Write the figure as PNG and as PDF beside it; the suffix of `path`, if any, is replaced.
 
     The same figure gives the same bytes: no dates inside. A PNG is made coarser until it stays below 300 kB.
+    The PDF drops into a two-column paper: fonts embedded as TrueType, titles that its caption gives left out.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,6 +153,9 @@ def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
             break
     write_bytes(png, content)
     buffer = BytesIO()
+    for text in figure.findobj(lambda artist: artist.get_gid() == _CAPTION):
+        letter, gap, _ = text.get_text().partition("   ")  # type: ignore[attr-defined]
+        text.set_text(letter if gap else "")  # type: ignore[attr-defined]
     figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
     write_bytes(pdf, buffer.getvalue())
     return png, pdf

@@ -32,30 +32,37 @@ from sidestep.views.style import (
 PAPER_CONVERGED = 80
 PAPER_EPISODES = 200
 _MANY_RUNS = 6
+_BESIDE = -0.19
+"""Where a panel's letter stands in a column, in widths of the axes: above their labels, beside the legend."""
 _MOST_SHIELDS_WITH_EPISODES = 2
 
 
-def reward_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
+def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = WIDTH) -> tuple[Path, Path]:
     """Accumulated reward over training episodes, and below it how every episode ended.
 
     Thick: mean of the last 20 episodes, and over several seeds the interquartile mean of it with the range of
     the seeds; faint: each episode, for up to two shields (see `shows_episodes`). A diamond marks convergence
-    (mean of 20 at least 940). Writes PNG and PDF.
+    (mean of 20 at least 940). Writes PNG and PDF, `width` inches wide.
     """
     groups = by_shield(runs)
     rows = [run for group in groups.values() for run in group]
     with house_style():
         row_height = 0.24 if len(rows) <= _MANY_RUNS else 0.16
         raster_height = row_height * max(len(rows), 1) + 0.25
-        figure = new_figure(WIDTH, 2.9 + raster_height)
+        # In a column there is room for the letters of the panels alone.
+        narrow = width < WIDTH
+        figure = new_figure(width, (2.5 if narrow else 2.9) + raster_height)
         top, raster = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, raster_height])
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = shield_colour(shield, position), shield_words(shield)
             kind = "line" if len(groups) == 1 else "dots" if shows_episodes(runs) else "none"
             _draw_returns(top, group, colour, words, shield_dashes(shield), episodes_as=kind)
-        panel_titles([top, raster], ["Accumulated reward per training episode", "How each episode ended"])
-        _finish_returns(top, rows)
-        _draw_outcomes(raster, rows)
+        titles = ["Accumulated reward per training episode", "How each episode ended"]
+        panel_titles([top, raster], ["", ""] if narrow else titles, in_caption=True)
+        _finish_returns(top, rows, narrow=narrow)
+        _draw_outcomes(raster, rows, narrow=narrow)
+        if narrow:
+            raster.set_title(raster.get_title("left"), x=_BESIDE)
         return save(figure, path)
 
 
@@ -105,7 +112,7 @@ def _draw_returns(
         )
 
 
-def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
+def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
     longest = max((len(run.metrics) for run in runs), default=1)
     light_grid(axes, "y")
     axes.axhline(CONVERGENCE_RETURN, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
@@ -118,7 +125,7 @@ def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
         axes.text(
             PAPER_CONVERGED,
             0.03,
-            "the paper converged by here ",
+            "the paper " if narrow else "the paper converged by here ",
             transform=axes.get_xaxis_transform(),
             fontsize=7,
             ha="right",
@@ -128,19 +135,22 @@ def _finish_returns(axes: Axes, runs: Sequence[Run]) -> None:
     handles, _ = axes.get_legend_handles_labels()
     diamond = Line2D(
         [], [], marker="D", linestyle="none", color=INK, markersize=4.5,
-        label=f"converged: mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f}",
+        label="converged"
+        if narrow
+        else f"converged: mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f}",
     )  # fmt: skip
     # Above the axes, where no curve can run.
     in_one_row = len(handles) <= 3 and len(runs) == len(handles)
-    columns, rows = (4, 1) if in_one_row else (3, len(handles) // 3 + 1)
-    axes.set_title(axes.get_title("left"), pad=6.0 + 14.0 * rows)
+    most = 2 if narrow else 3
+    columns, rows = (4, 1) if in_one_row and not narrow else (most, len(handles) // most + 1)
+    axes.set_title(axes.get_title("left"), pad=6.0 + 14.0 * rows, x=_BESIDE if narrow else 0.0)
     axes.legend(
         handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
         borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5,
-    )  # fmt: skip
+    ).set_in_layout(not narrow)  # fmt: skip
 
 
-def _draw_outcomes(axes: Axes, runs: Sequence[Run]) -> None:
+def _draw_outcomes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
     many = len(runs) > _MANY_RUNS
     for row, run in enumerate(runs):
         for outcome, colour in OUTCOME_COLOURS.items():
@@ -160,14 +170,14 @@ def _draw_outcomes(axes: Axes, runs: Sequence[Run]) -> None:
     handles = [
         Line2D(
             [], [], marker=OUTCOME_MARKERS[name], linestyle="none", color=colour, markeredgewidth=0,
-            markersize=5, label=OUTCOME_WORDS[name],
+            markersize=5, label=name.replace("_", " ") if narrow else OUTCOME_WORDS[name],
         )
         for name, colour in OUTCOME_COLOURS.items()
     ]  # fmt: skip
     axes.legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2,
-        handletextpad=0.1, columnspacing=1.2,
-    )  # fmt: skip
+        handletextpad=0.1, columnspacing=0.7 if narrow else 1.2,
+    ).set_in_layout(not narrow)  # fmt: skip
 
 
 def safety_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:

@@ -101,6 +101,7 @@ def trajectory_figure(
                 "How far the shield changed the velocity (colours as above)",
                 "Answer",
             ],
+            in_caption=True,
         )
         return save(figure, path)
 
