@@ -76,6 +76,9 @@ def test_damaged_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no recorded trajectory"):
         load_trajectory(tmp_path / "scene.npz")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "other.npz").read_bytes()[:100])
+    with pytest.raises(ValueError, match="no recorded trajectory"):
+        load_trajectory(tmp_path / "cut.npz")
     with pytest.raises(ValueError, match="no recorded trajectory"):
         load_trajectory(tmp_path / "other.npz")
 

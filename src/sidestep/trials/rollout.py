@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-import os
+import zipfile
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -168,7 +168,7 @@ def load_trajectory(path: str | Path) -> Trajectory:
     place = jnp.zeros(2)
     example = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place)
     try:
-        with np.load(os.fspath(path), allow_pickle=False) as archive:
+        with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
             arrays = {name: jnp.asarray(archive[name]) for name in archive.files}
         leaves = [arrays.pop(f"worlds.{name}") for name in _named_leaves(example)]
         worlds = jax.tree.unflatten(jax.tree.structure(example), leaves)
@@ -178,5 +178,5 @@ def load_trajectory(path: str | Path) -> Trajectory:
             events=Events(**{name.removeprefix("events."): values for name, values in events.items()}),
             **arrays,
         )
-    except (KeyError, TypeError, ValueError, EOFError) as error:
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} holds no recorded trajectory: {error}") from error

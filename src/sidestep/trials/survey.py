@@ -4,6 +4,7 @@ shield stepped in, and the worst episodes as recorded."""
 from __future__ import annotations
 
 import dataclasses
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
@@ -164,7 +165,7 @@ def load_survey(folder: str | Path) -> Survey | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         where = {name.removeprefix(_MAP): arrays.pop(name) for name in list(arrays) if name.startswith(_MAP)}
         seed = int(arrays.pop("seed"))
@@ -175,7 +176,7 @@ def load_survey(folder: str | Path) -> Survey | None:
             for number, hazard in zip(numbers, hazards, strict=True)
             if _worst_path(folder, int(number)).is_file()
         )
-    except (KeyError, TypeError, ValueError, EOFError, OSError) as error:
+    except (KeyError, TypeError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
         raise RunError(
             f"{path} is not readable ({error}); delete it to have the episodes run again"
         ) from error

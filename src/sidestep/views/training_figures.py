@@ -143,7 +143,9 @@ def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
     in_one_row = len(handles) <= 3 and len(runs) == len(handles)
     most = 2 if narrow else 3
     columns, rows = (4, 1) if in_one_row and not narrow else (most, len(handles) // most + 1)
-    axes.set_title(axes.get_title("left"), pad=6.0 + 14.0 * rows, x=_BESIDE if narrow else 0.0)
+    axes.set_title(
+        axes.get_title("left"), pad=(-8.0 if narrow else 6.0) + 14.0 * rows, x=_BESIDE if narrow else 0.0
+    )
     axes.legend(
         handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
         borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5,
