@@ -42,3 +42,38 @@ def run_of():
         return Run(config=config, metrics=metrics)
 
     return run_of
+
+
+@pytest.fixture(scope="session")
+def survey_of(chase):
+    """`survey_of(clearances, corrected)`: a survey of these least distances to capture, m, and two worst
+    episodes, captures; `corrected` periods with a correction of 0.1 m/s straight ahead of the pursuer."""
+    import numpy as np
+
+    from sidestep.trials import Evaluation, InterventionMap, Survey, WorstEpisode
+    from sidestep.trials.intervention_map import CELLS
+
+    def survey_of(clearances=(-0.001, 0.02, 0.4), corrected=40):
+        count = len(clearances)
+        lost = np.asarray(clearances) <= 0.0
+        sums = np.zeros((CELLS**2 + 1, 6))
+        sums[CELLS * (CELLS // 2) + CELLS - 4] = [50, corrected, 0, 0.1 * corrected, 0.1 * corrected, 0.0]
+        sums[-1, 0] = 50
+        evaluation = Evaluation(
+            outcome=np.where(lost, 0, 2),
+            returns=np.zeros(count),
+            steps=np.full(count, 100),
+            times=np.full(count, 5.0),
+            min_pursuer_clearance=np.asarray(clearances, float),
+            min_obstacle_clearance=np.full(count, 0.3),
+            interventions=np.full(count, 10),
+            infeasible=np.zeros(count, int),
+            invalid=np.zeros(count, int),
+            mean_correction=np.full(count, 0.01),
+            max_correction=np.full(count, 0.1),
+            map=InterventionMap.of_sums(0.5, sums),
+        )
+        worst = (WorstEpisode(0, "capture", chase()), WorstEpisode(1, "collision", chase(reverse=True)))
+        return Survey(evaluation, 7, worst)
+
+    return survey_of

@@ -60,7 +60,7 @@ def evaluation(captured=12):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, chase, run_of):
+def whole(tmp_path_factory, chase, run_of, survey_of):
     """A report with everything in it."""
     paper = replace(
         run_of("paper", ["captured"] * 4 + ["reached"] * 30),
@@ -69,8 +69,11 @@ def whole(tmp_path_factory, chase, run_of):
         scene=chase(),
         untrained_scene=chase(),
         capture=chase(reverse=True),
+        survey=survey_of(),
     )
-    game = replace(run_of("game"), evaluation=evaluation(0), scene=chase(steps=60))
+    game = replace(
+        run_of("game"), evaluation=evaluation(0), scene=chase(steps=60), survey=survey_of((0.001, 0.5), 20)
+    )
     path = tmp_path_factory.mktemp("report") / "report.html"
     return write_report([game, paper], path, command="sidestep reproduce --seed 0 & <now>")
 
@@ -79,16 +82,17 @@ def test_report_loads_nothing_from_anywhere(whole):
     page = read(whole)
     assert page.loads
     assert all(load.startswith("data:image/png;base64,") for load in page.loads)
-    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
+    assert not {"link", "iframe", "object", "embed", "base"} & set(page.tags)
     source = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", whole.read_text())
     assert "http" not in source
     assert "url(" not in source
     assert "@import" not in source
+    assert not re.search(r"\bimport\b|\bfetch\b|XMLHttp|WebSocket|sendBeacon", source)
 
 
 def test_pictures_in_the_report_are_whole(whole):
     page = read(whole)
-    assert len(page.loads) == 6
+    assert len(page.loads) == 8
     for load in page.loads:
         picture = base64.b64decode(load.split(",")[1], validate=True)
         assert picture.startswith(b"\x89PNG")
@@ -104,6 +108,9 @@ def test_report_says_what_the_data_say(whole):
     assert "0.20078 m" in words
     assert "The pursuer reverses" in words
     assert words.index("Paper's shield") < words.index("Game shield")
+    # Two shields' surveys: 3 and 2 episodes, 100 periods each, of which 50 beyond the map.
+    assert "(paper's shield: 3, game shield: 2)" in words
+    assert "Game shield: 2 episodes, 100 periods, of which 50.0 % further off than drawn" in words
 
 
 def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, tmp_path, run_of):
@@ -120,19 +127,33 @@ def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, tm
     assert "Faint" in read(whole).words
 
 
-def test_report_escapes_what_it_shows(tmp_path, run_of):
-    run = run_of()
+def test_report_escapes_what_it_shows(tmp_path, run_of, survey_of):
+    run = run_of("</script><script>alert(1)//")
     config = {**run.config, "pursuer": "<script>alert(1)</script>"}
-    path = write_report([replace(run, config=config)], tmp_path / "r.html", command="a && <b>")
-    text = path.read_text()
+    run = replace(run, config=config, survey=survey_of())
+    text = write_report([run], tmp_path / "r.html", command="a && <b>").read_text()
     assert "<script>" not in text
     assert "&lt;script&gt;" in text
     assert "a &amp;&amp; &lt;b&gt;" in text
+    # The player's data and the player, and nothing that the data ended or began.
+    assert text.count("</script>") == text.count("<script") == 2
+    data = text.partition('id="replay-data">')[2].partition("</script>")[0]
+    assert json.loads(data)[0]["shield"] == run.shield
 
 
 def test_figures_are_left_beside_the_report_in_both_formats(whole):
     names = {path.name for path in (whole.parent / "figures").iterdir()}
-    for figure in ("reward", "safety", "outcomes", "capture", "test-scene-paper", "test-scene-game"):
+    for figure in (
+        "reward",
+        "reward-column",
+        "clearances",
+        "interventions",
+        "safety",
+        "outcomes",
+        "capture",
+        "test-scene-paper",
+        "test-scene-game",
+    ):
         assert {f"{figure}.png", f"{figure}.pdf"} <= names
 
 
@@ -146,19 +167,43 @@ def test_report_of_a_run_folder(tmp_path, chase, run_of):
     write_json(folder / "evaluation.json", evaluation(0))
     save_trajectory(folder / "test_scene.npz", chase(steps=40))
     path = write_report([folder], folder / "report.html")
-    assert "5 / 5" in read(path).words
+    words = read(path).words
+    assert "5 / 5" in words
+    # Such as a run from before there were surveys.
+    assert "hold no record of where a shield stepped in" in words
+    assert "in each episode of the training (game shield: 5)" in words
+    assert "The worst episodes" not in words
     assert json.loads((folder / "config.json").read_text())["shield"] == "game"
+
+
+def test_runs_of_other_scenarios_are_not_compared_in_silence(whole, tmp_path, run_of):
+    one, other = run_of("game"), run_of("joint")
+    faster = {**other.config["scenario"], "pursuer_speed": 0.25}
+    runs = [one, replace(other, config={**other.config, "scenario": faster})]
+    assert "pursuer speed 0.2 or 0.25" in read(write_report(runs, tmp_path / "r.html")).words
+    assert "like with like" not in read(whole).words
+
+
+def test_eight_runs_of_two_shields_are_pooled_and_the_file_stays_small(tmp_path, run_of, survey_of):
+    runs = [
+        replace(run_of(shield, seed=seed), survey=survey_of())
+        for shield in ("joint", "game")
+        for seed in range(4)
+    ]
+    path = write_report(runs, tmp_path / "r.html")
+    words = read(path).words
+    assert "120 / 120" in words
+    assert "4 of 4 seeds, at 20, 20, 20, 20" in words
+    assert "(game shield: 12, joint shield: 12)" in words
+    assert "Joint shield: 12 episodes, 400 periods" in words
+    replays = json.loads(path.read_text().partition('id="replay-data">')[2].partition("</script>")[0])
+    assert [one["group"] for one in replays[:4]] == [f"Game shield, seed {seed}" for seed in range(4)]
+    assert len(replays) == 8
+    assert path.stat().st_size < 1_500_000
 
 
 def test_run_without_an_episode_gives_a_report(tmp_path, run_of):
     assert "0 / 0" in read(write_report([run_of(outcomes=[])], tmp_path / "r.html")).words
-
-
-def test_several_seeds_are_pooled(tmp_path, run_of):
-    runs = [run_of("game", ["reached"] * 25, seed=seed) for seed in range(4)]
-    words = read(write_report(runs, tmp_path / "r.html")).words
-    assert "100 / 100" in words
-    assert "4 of 4 seeds, at 20, 20, 20, 20" in words
 
 
 def test_folder_without_a_run_is_named(tmp_path):

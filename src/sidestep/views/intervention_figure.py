@@ -143,7 +143,7 @@ def _blocks(values: Float[np.ndarray, "cells cells"]) -> Float[np.ndarray, "arro
 
 def _draw_directions(axes: Axes, one: InterventionMap) -> None:
     """Arrows along the mean correction, for blocks of cells in which there is one to speak of."""
-    periods = _blocks(one.periods)
+    periods = _blocks(one.periods.astype(float))
     weight = np.maximum(periods, 1)
     ahead, left = _blocks(one.ahead) / weight, _blocks(one.left) / weight
     size = np.hypot(ahead, left)
