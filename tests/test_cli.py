@@ -19,6 +19,7 @@ from sidestep.commands.reproduce import Reproduce
 from sidestep.commands.train import Train
 from sidestep.learning import train
 from sidestep.safety.catalogue import SHIELDS
+from sidestep.trials import load_survey
 from sidestep.trials.reproduction import reproduce
 
 LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
@@ -139,12 +140,37 @@ def test_interrupt_stops_cleanly_and_the_run_goes_on_from_there(run, tmp_path):
     assert lines[:2] == (run[0] / "metrics.jsonl").read_text().splitlines()
 
 
-def test_report_of_a_run_needs_no_network(run):
+def test_report_of_a_run_needs_no_network(run, monkeypatch):
     out, _ = run
-    assert main(["report", str(out)]) == 0
+    assert main(["report", str(out), "--episodes", "2"]) == 0
     page = (out / "report.html").read_text()
     assert 'src="http' not in page
     assert "data:image/png" in page
+    # What the training left out was run, once, and kept.
+    assert "The worst episodes" in page
+    measured = (out / "episodes.npz").stat().st_mtime_ns
+    survey = load_survey(out)
+    assert survey is not None
+    assert survey.evaluation.episodes == 2
+    monkeypatch.setattr("sidestep.views.write_report", lambda *_, **__: out)
+    assert main(["report", str(out), "--episodes", "3"]) == 0
+    assert (out / "episodes.npz").stat().st_mtime_ns == measured
+
+
+def test_report_counts_no_run_twice_and_writes_over_nothing_but_a_report(run, tmp_path, capsys):
+    out, _ = run
+    assert main(["report", str(out), str(out / ".." / out.name)]) == 2
+    assert "given twice" in capsys.readouterr().err
+    notes = tmp_path / "notes.html"
+    notes.write_text("<title>mine</title>")
+    assert main(["report", str(out), "--out", str(notes)]) == 2
+    assert "give --out another name" in capsys.readouterr().err
+    assert notes.read_text() == "<title>mine</title>"
+    assert main(["report", str(out), "--out", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+    (tmp_path / "config.json").write_text('{"study": ["none", "game"]}')
+    assert main(["report", str(tmp_path)]) == 2
+    assert "not begun to train" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

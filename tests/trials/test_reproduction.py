@@ -39,7 +39,13 @@ def test_study_leaves_everything_it_reports(study):
     assert summary["shields"]["game"]["scene_trained"]["seconds"] == pytest.approx(
         0.05 * game.scene_trained.length, abs=1e-4
     )
-    for name in ("policy.npz", "evaluation.json", "evaluation_untrained.json", "test_scene.npz"):
+    for name in (
+        "policy.npz",
+        "episodes.npz",
+        "evaluation.json",
+        "evaluation_untrained.json",
+        "test_scene.npz",
+    ):
         assert (out / "game" / name).is_file()
 
 

@@ -131,6 +131,14 @@ def test_survey_comes_back_from_disk_as_it_was(survey, tmp_path):
     assert (tmp_path / "episodes.npz").stat().st_size < 60_000
 
 
+def test_survey_of_a_policy_that_was_trained_further_since_is_not_shown(survey, tmp_path):
+    (tmp_path / "policy.npz").write_bytes(b"as it was")
+    save_survey(tmp_path, survey)
+    assert load_survey(tmp_path) is not None
+    (tmp_path / "policy.npz").write_bytes(b"trained further")
+    assert load_survey(tmp_path) is None
+
+
 def test_folder_from_before_has_no_survey_and_a_damaged_one_is_named(survey, tmp_path):
     assert load_survey(tmp_path) is None
     save_survey(tmp_path, survey)

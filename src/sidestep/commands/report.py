@@ -84,9 +84,9 @@ def _refuse_other_files(path: Path) -> None:
 def _look_closer(folder: Path, episodes: int, console: Console) -> None:
     """Run random episodes with the policy of a run whose folder has no record of any, and keep them there."""
     from sidestep.learning.records import read_json
-    from sidestep.trials.survey import EPISODES_FILE, save_survey, survey_run
+    from sidestep.trials import load_survey, save_survey, survey_run
 
-    if not episodes or (folder / EPISODES_FILE).exists() or not (folder / "policy.npz").exists():
+    if not episodes or not (folder / "policy.npz").exists() or load_survey(folder) is not None:
         return
     config = read_json(folder / "config.json")
     try:

@@ -4,6 +4,7 @@ shield stepped in, and the worst episodes as recorded."""
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -147,6 +148,7 @@ def save_survey(folder: str | Path, survey: Survey) -> None:
         arrays |= {_MAP + name: values for name, values in survey.evaluation.map.to_arrays().items()}
     arrays |= {
         "seed": np.asarray(survey.seed),
+        "policy": np.asarray(_policy_digest(folder)),
         "worst_numbers": np.array([episode.number for episode in survey.worst], dtype=int),
         "worst_hazards": np.array([HAZARDS.index(episode.hazard) for episode in survey.worst], dtype=int),
     }
@@ -156,7 +158,8 @@ def save_survey(folder: str | Path, survey: Survey) -> None:
 
 
 def load_survey(folder: str | Path) -> Survey | None:
-    """What `save_survey` wrote; None for a folder without it, such as one from before there were surveys.
+    """What `save_survey` wrote; None for a folder without it, such as one from before there were surveys, or
+    in which another policy was put since: training went on.
 
     **Raises** `RunError` when the file is damaged.
     """
@@ -167,6 +170,8 @@ def load_survey(folder: str | Path) -> Survey | None:
     try:
         with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
+        if str(arrays.pop("policy")) != _policy_digest(folder):
+            return None
         where = {name.removeprefix(_MAP): arrays.pop(name) for name in list(arrays) if name.startswith(_MAP)}
         seed = int(arrays.pop("seed"))
         numbers, hazards = arrays.pop("worst_numbers"), arrays.pop("worst_hazards")
@@ -181,6 +186,12 @@ def load_survey(folder: str | Path) -> Survey | None:
             f"{path} is not readable ({error}); delete it to have the episodes run again"
         ) from error
     return Survey(evaluation, seed, worst)
+
+
+def _policy_digest(folder: Path) -> str:
+    """Which policy a run folder holds; empty when it holds none."""
+    path = folder / "policy.npz"
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def _worst_path(folder: Path, number: int) -> Path:
