@@ -186,7 +186,7 @@ def test_runs_of_other_scenarios_are_not_compared_in_silence(whole, tmp_path, ru
 
 def test_eight_runs_of_two_shields_are_pooled_and_the_file_stays_small(tmp_path, run_of, survey_of):
     runs = [
-        replace(run_of(shield, seed=seed), survey=survey_of())
+        replace(run_of(shield, seed=seed), survey=survey_of(), evaluation=evaluation(10 * seed))
         for shield in ("joint", "game")
         for seed in range(4)
     ]
@@ -194,6 +194,9 @@ def test_eight_runs_of_two_shields_are_pooled_and_the_file_stays_small(tmp_path,
     words = read(path).words
     assert "120 / 120" in words
     assert "4 of 4 seeds, at 20, 20, 20, 20" in words
+    # 0, 10, 20 and 30 captured of 100 each.
+    low, high = wilson_interval(60, 400)
+    assert f"captured 15.0 % {100 * low:.1f} % to {100 * high:.1f} %" in words
     assert "(game shield: 12, joint shield: 12)" in words
     assert "Joint shield: 12 episodes, 400 periods" in words
     replays = json.loads(path.read_text().partition('id="replay-data">')[2].partition("</script>")[0])

@@ -2,8 +2,10 @@
 
 from sidestep.views.capture_figure import capture_figure
 from sidestep.views.certificate_figure import certificate_figure
+from sidestep.views.clearance_figure import clearance_figure
 from sidestep.views.comparison import Section, comparison_sections, markdown_tables
 from sidestep.views.episode_report import write_episode_report
+from sidestep.views.intervention_figure import intervention_figure
 from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
@@ -18,7 +20,9 @@ __all__ = [
     "Section",
     "capture_figure",
     "certificate_figure",
+    "clearance_figure",
     "comparison_sections",
+    "intervention_figure",
     "load_run",
     "markdown_tables",
     "outcome_figure",

@@ -21,6 +21,7 @@ from sidestep.views.capture_figure import capture_figure
 from sidestep.views.clearance_figure import clearance_figure
 from sidestep.views.html import data_uri, shown_number, shown_value
 from sidestep.views.intervention_figure import intervention_figure
+from sidestep.views.pooling import pooled_evaluation
 from sidestep.views.replay import AFTER, BEFORE, episodes_for_page, player
 from sidestep.views.runs import Run, by_shield, load_run
 from sidestep.views.style import COLUMN, OUTCOME_WORDS, shield_colour, shield_words
@@ -81,8 +82,8 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
     groups = by_shield(runs)
     first = runs[0]
     scenario = first.scenario
-    evaluations = {shield: values for shield, (_, values) in _first_of(groups, "evaluation").items()}
-    untrained = {shield: values for shield, (_, values) in _first_of(groups, "untrained_evaluation").items()}
+    evaluations = _pooled_evaluations(groups, "evaluation")
+    untrained = _pooled_evaluations(groups, "untrained_evaluation")
     untrained_scenes = {shield: scene for shield, (_, scene) in _first_of(groups, "untrained_scene").items()}
     scenes = _first_of(groups, "scene")
     return {
@@ -98,7 +99,7 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         ),
         "reward": _reward(runs, folder),
         "shows_episodes": shows_episodes(runs),
-        "several_seeds": any(len(group) > 1 for group in groups.values()),
+        "several_runs": any(len(group) > 1 for group in groups.values()),
         "evaluations": evaluations,
         "untrained": untrained,
         "untrained_scenes": _figure(
@@ -125,6 +126,13 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "number": shown_number,
         "paper_converged": PAPER_CONVERGED,
     }
+
+
+def _pooled_evaluations(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, dict[str, Any]]:
+    """By shield, the evaluations of its runs as one, where there are any."""
+    found = {shield: [getattr(run, field) for run in group] for shield, group in groups.items()}
+    measured = {shield: [one for one in many if one is not None] for shield, many in found.items()}
+    return {shield: pooled_evaluation(many) for shield, many in measured.items() if many}
 
 
 def _first_of(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, tuple[Run, Any]]:

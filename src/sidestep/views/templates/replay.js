@@ -10,6 +10,7 @@ const NAMES = [
 ];
 const REST = 1.2; // s that the end is held before it begins again
 const TRAIL = 14; // s
+const NEAR = 2.5; // m
 
 function unpacked([low, step, text]) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -75,6 +76,14 @@ class Replay {
       pursuers.forEach((trail, k) => trail.push([this.series[`p${k}x`][i], this.series[`p${k}y`][i], i * this.period]));
     }
     return { evader, pursuers };
+  }
+}
+
+// Keeps what matters in view: a target or an obstacle far away would make everybody tiny.
+class NearCamera extends Camera {
+  follow(bodies, free, seconds) {
+    const [x, y] = bodies[0];
+    super.follow(bodies.filter((body) => Math.hypot(body[0] - x, body[1] - y) < NEAR), free, seconds);
   }
 }
 
@@ -161,6 +170,7 @@ class Player {
   constructor(replays) {
     this.replays = replays;
     this.scene = new Scene(one(".scene"));
+    this.scene.camera = new NearCamera();
     this.strip = new Strip(one(".strip"));
     this.pace = 1;
     this.playing = false;

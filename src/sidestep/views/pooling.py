@@ -1,0 +1,38 @@
+"""Evaluations of several runs as one, from what each left on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sidestep.learning.records import OUTCOMES
+from sidestep.trials import wilson_interval
+
+_LEAST = ("min_pursuer_clearance", "min_obstacle_clearance")
+_SHARES = ("intervention_rate", "infeasible_rate", "mean_correction")
+
+
+def pooled_evaluation(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the tables and the outcome figure show of `Evaluation.to_dict`, over all of these evaluations.
+
+    Counts add up and get new bounds; shares of control periods are weighted by the periods of each (by its
+    episodes where an evaluation does not say). A median of several is not known from theirs, so it is None.
+    One evaluation is given back as it is.
+    """
+    if len(reports) == 1:
+        return dict(reports[0])
+    episodes = sum(report["episodes"] for report in reports)
+    pooled: dict[str, Any] = {"episodes": episodes, "reach_time_median": None}
+    for name in (*OUTCOMES, "safe"):
+        count = sum(report[name] for report in reports)
+        low, high = wilson_interval(count, episodes)
+        pooled |= {
+            name: count, f"{name}_rate": count / episodes, f"{name}_rate_low": low, f"{name}_rate_high": high,
+        }  # fmt: skip
+    for name in _LEAST:
+        pooled[name] = min((report[name] for report in reports if report[name] is not None), default=None)
+    counted = "env_steps" if all("env_steps" in report for report in reports) else "episodes"
+    weight = sum(report[counted] for report in reports)
+    for name in _SHARES:
+        pooled[name] = sum(report[name] * report[counted] for report in reports) / weight
+    return pooled
