@@ -190,6 +190,8 @@ def test_report_counts_no_run_twice_and_writes_over_nothing_but_a_report(run, tm
         (["train", "--out", "{out}", "--resume"], "no run"),
         (["evaluate", "{out}"], "no run"),
         (["report", "{out}"], "no run"),
+        (["report"], "at least one run"),
+        (["report", "{out}", "--episodes", "-1"], "episodes"),
     ],
 )
 def test_bad_input_is_named_and_nothing_is_written(arguments, named, tmp_path, capsys):

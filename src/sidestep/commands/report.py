@@ -32,6 +32,8 @@ def run(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
     from sidestep.views import write_report
 
+    if not command.runs:
+        raise ValueError("a report needs at least one run folder, or a log")
     if any(path.suffix == ".mcap" for path in command.runs):
         return _report_log(command, console)
     if command.episodes < 0:
