@@ -1,0 +1,366 @@
+"""An episode in motion: the world beside the frame of the pursuer, and the shield's trace below."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast, final
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from sidestep.trials import Trajectory
+from sidestep.views.motion import Instant, Motion, nearest_pursuers, relative
+from sidestep.views.moving_panel import LEVEL_COLOUR, LEVELS, NOMINAL_DASHES, MovingPanel
+from sidestep.views.outlines import PURSUIT_SHIELDS
+from sidestep.views.scene import capture_set_outline, correction_colours
+from sidestep.views.style import (
+    EVADER,
+    FAINT,
+    INK,
+    OBSTACLE,
+    OUTCOME_COLOURS,
+    OUTCOME_WORDS,
+    PURSUER,
+    TARGET,
+    house_style,
+    light_grid,
+    shield_words,
+)
+from sidestep.views.trajectory_figures import (
+    ANSWERS,
+    correction_norm,
+    draw_barriers,
+    draw_corrections,
+    scene_extent,
+    scene_margin,
+)
+from sidestep.views.video_files import VideoError, check_video, write_video_file
+from sidestep.world import Scenario
+
+_INCHES = (8.0, 4.5)
+_WORLD, _SEEN = (0.46, 1.86, 4.72, 2.06), (5.62, 1.86, 2.06, 2.06)
+_BARRIERS, _CORRECTIONS = (0.46, 0.76, 7.22, 0.44), (0.46, 0.36, 7.22, 0.28)
+"""Places of the axes: left, bottom, width, height in inches. Fixed, so that nothing ever jitters."""
+_RECENT_SECONDS = 5.0
+_FINEST = 0.025
+_WIDEST = 3.2
+"""The pursuer's frame shows at most so many times the reach of its capture set."""
+_SHORTEST, _MOST_PIXELS = 160, 4096
+_RATES = {".mp4": 30, ".gif": 20, ".webp": 20}
+_WIDTHS = {".mp4": 1280, ".gif": 720, ".webp": 720}
+
+
+def animate(
+    scenario: Scenario,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    shield: str = "",
+    title: str | None = None,
+    speed: float = 1.0,
+    rate: int | None = None,
+    width: int | None = None,
+    hold: float = 1.5,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write an episode as a video: .mp4 (H.264), .gif or .webp, as the suffix of `path` says.
+
+    Left the world, right the evader as the nearest pursuer sees it, below the barriers and the corrections
+    over time, in the colours of the figures. Between control periods everybody moves as `Motion` says. It
+    ends with the outcome.
+
+    **Arguments:** `shield` its name, for words and for which barrier's levels are drawn; `title` instead of
+    the shield's; `speed` how many times faster than it was; `rate` pictures per second (30; 20 for .gif and
+    .webp); `width` in pixels, of which 9/16 are the height (1280; 720 for .gif and .webp); `hold` how long
+    (s) the end stays; `progress` is told how many pictures are done, and of how many.
+
+    **Returns** the path. A file that exists is replaced when the new one is complete; an interruption leaves
+    the old one, or nothing. **Raises** `VideoError` before any work when the file cannot be written as asked
+    or a package is missing (the extra `[video]`), or a number makes no sense.
+    """
+    path = check_video(path)
+    suffix = path.suffix.lower()
+    rate = _RATES[suffix] if rate is None else rate
+    width = _WIDTHS[suffix] if width is None else width
+    check_numbers(speed, rate, width, hold)
+    stage = Stage(scenario, trajectory, shield=shield, title=title, speed=speed, width=width)
+    duration = stage.motion.duration
+    times = [*np.arange(0.0, duration - 1e-9, speed / rate), duration]
+
+    def pictures() -> Iterator[np.ndarray]:
+        for number, time in enumerate(times, start=1):
+            # The very end comes with the outcome, and stays for the hold.
+            yield stage.picture(float(time), end=number == len(times))
+            if progress is not None:
+                progress(number, len(times))
+
+    def samples() -> Iterator[np.ndarray]:
+        yield from (stage.picture(time) for time in np.linspace(0.0, duration, 6))
+        yield stage.picture(duration, end=True)
+
+    chosen_from = None if suffix == ".mp4" else samples()
+    return write_video_file(path, pictures(), rate, hold=hold, samples=chosen_from)
+
+
+def check_numbers(speed: float, rate: int, width: int, hold: float = 0.0) -> None:
+    """Raises `VideoError` when a video cannot have these numbers."""
+    if not (np.isfinite(speed) and speed > 0.0):
+        raise VideoError(f"speed = {speed}: it must be greater than 0")
+    if not 1 <= rate <= 100:
+        raise VideoError(f"rate = {rate}: it must be 1 to 100 pictures per second")
+    if not _SHORTEST <= width <= _MOST_PIXELS:
+        raise VideoError(f"width = {width}: it must be {_SHORTEST} to {_MOST_PIXELS} pixels")
+    if not (np.isfinite(hold) and hold >= 0.0):
+        raise VideoError(f"hold = {hold}: it must be 0 s or more")
+
+
+@final
+class Stage:
+    """The pictures of an animation, at any time of the episode and in any order.
+
+    What never changes is drawn once; each picture is that, with what moves drawn on top of it.
+
+    **Arguments:** as for `animate`; `speed` is only told.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        trajectory: Trajectory,
+        *,
+        shield: str = "",
+        title: str | None = None,
+        speed: float = 1.0,
+        width: int = 1280,
+    ):
+        if trajectory.length < 1:
+            raise VideoError("the episode has no control period to show")
+        self.motion = Motion(scenario, trajectory)
+        self._scenario, self._trajectory = scenario, trajectory
+        self._ways = _Ways(scenario, trajectory, self.motion)
+        start = self.motion.at(0.0)
+        with house_style():
+            size = (2 * round(width / 2), 2 * round(width * _INCHES[1] / _INCHES[0] / 2))
+            self._figure = Figure(figsize=(size[0] / 160, size[1] / 160), dpi=160)
+            self._figure.set_dpi(width / _INCHES[0])
+            self._figure.set_size_inches(size[0] / self._figure.dpi, size[1] / self._figure.dpi)
+            self._canvas = FigureCanvasAgg(self._figure)
+            self.world, self.seen = self._axes(_WORLD), self._axes(_SEEN)
+            strips = self._axes(_BARRIERS), self._axes(_CORRECTIONS)
+            _set_up_world(self.world, scenario, trajectory)
+            self._titles = [
+                self._text(_WORLD[0], 3.97, "The world, m", weight="bold", size=8),
+                self._text(_SEEN[0], 3.97, "", weight="bold", size=8),
+            ]
+            _set_up_seen(self.seen, scenario, self._ways.distances)
+            pursuit, pursuers = shield in PURSUIT_SHIELDS, len(start.poses)
+            others = pursuers + len(start.obstacles)
+            self._panels = (
+                MovingPanel(self.world, scenario, start, trails=others, pursuit=pursuit),
+                MovingPanel(self.seen, scenario, start, trails=0, pursuit=pursuit),
+            )
+            self._veils = _draw_strips(*strips, scenario, trajectory)
+            self._draw_key(len(start.obstacles) > 0)
+            words = title if title is not None else shield_words(shield) if shield else ""
+            self._words = words[:1].upper() + words[1:]
+            self._heading = self._text(_WORLD[0], 4.24, self._words, weight="bold", size=11)
+            right = _SEEN[0] + _SEEN[2]
+            self._clock = self._text(right, 4.24, "", size=9, ha="right")
+            self._answer = self._text(right - 1.35, 4.24, "", size=8, ha="right")
+            self._speed = "" if speed == 1.0 else f" (× {speed:g})"
+            moving = [*self._titles[1:], self._heading, self._clock, self._answer]
+            self._moving: list[tuple[Axes | None, Artist]] = [
+                (panel.axes, artist) for panel in self._panels for artist in panel.artists
+            ]
+            self._moving += [(strip, veil) for strip, veils in self._veils for veil in veils]
+            self._moving += [(None, words) for words in moving]
+            for _, artist in self._moving:
+                artist.set_animated(True)
+            self._canvas.draw()
+        self._still = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def _axes(self, place: tuple[float, float, float, float]) -> Axes:
+        across, up = _INCHES
+        left, bottom, width, height = place
+        return self._figure.add_axes((left / across, bottom / up, width / across, height / up))
+
+    def _text(self, x: float, y: float, words: str, *, size: float, **look: Any) -> Any:
+        return self._figure.text(
+            x / _INCHES[0], y / _INCHES[1], words, va="baseline", fontsize=size, **look
+        )
+
+    def _draw_key(self, obstacles: bool) -> None:
+        handles: list[Any] = [
+            Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
+            Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
+            Line2D([], [], color=TARGET, marker="*", linestyle="none", markersize=7, label="target"),
+            Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
+            Line2D([], [], color=PURSUER, linewidth=0.9, linestyle=(0, (3, 2)), label="capture set K"),
+            Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
+            Line2D([], [], color=LEVEL_COLOUR, linewidth=0.6, label=f"h = {', '.join(map(str, LEVELS))} m"),
+            Line2D([], [], color=EVADER, linewidth=1.5, label="velocity driven"),
+            Line2D([], [], color=INK, linewidth=1.5, linestyle=NOMINAL_DASHES, label="velocity wished"),
+            Patch(facecolor=correction_colours()(0.6), label="shield corrects"),
+        ]
+        if obstacles:
+            handles.insert(4, Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
+        self._figure.legend(
+            handles=handles, loc="center", bbox_to_anchor=(0.5, 1.45 / _INCHES[1]), ncols=6, fontsize=6,
+            columnspacing=1.6, handletextpad=0.5, labelspacing=0.35, borderpad=0.0,
+        )  # fmt: skip
+
+    def picture(self, time: float, *, end: bool = False) -> UInt8[np.ndarray, "height width 3"]:
+        """The picture at a time (s); with the outcome if this is the `end`."""
+        self._place(time, end)
+        self._canvas.restore_region(self._still)
+        renderer = self._canvas.get_renderer()
+        for axes, artist in self._moving:
+            if axes is not None:
+                axes.draw_artist(artist)
+            else:
+                artist.draw(renderer)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _place(self, time: float, end: bool) -> None:
+        now, outcome = self.motion.at(time), self._trajectory.outcome if end else None
+        pursuer = self._ways.viewer(time)
+        pose, (world, seen) = now.poses[pursuer], self._panels
+        world.show(now, outcome)
+        world.show_trails(*self._ways.in_world(now))
+        from_it = now.seen_from(pose)
+        seen.show(from_it, outcome)
+        seen.show_trails(*self._ways.seen_by(pursuer, from_it))
+        for _, (veil, line) in self._veils:
+            cast(Rectangle, veil).set_x(time)
+            cast(Rectangle, veil).set_width(max(self.motion.duration - time, 0.0))
+            cast(Line2D, line).set_xdata([time, time])
+        number = f" {pursuer + 1}" if len(now.poses) > 1 else ""
+        self._titles[1].set_text(f"The evader in the frame of pursuer{number}, m" if number else "The evader in the pursuer's frame, m")
+        self._clock.set_text(f"{time:.2f} s{self._speed}")
+        colour, words = ANSWERS[int(np.asarray(self._trajectory.status)[now.period])]
+        self._answer.set_text(f"shield: {words}")
+        self._answer.set_color(INK if words == "unchanged" else colour)
+        if end:
+            told = f"{OUTCOME_WORDS[self._trajectory.outcome]} after {self.motion.duration:.2f} s"
+            told = f"{self._words}: {told}" if self._words else told[:1].upper() + told[1:]
+            self._heading.set_text(told)
+            self._heading.set_color(OUTCOME_COLOURS.get(self._trajectory.outcome, INK))
+        else:
+            self._heading.set_text(self._words)
+            self._heading.set_color(INK)
+
+
+def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
+    """Limits that hold everything that ever moves, at equal scales, filling the panel."""
+    low, high = scene_extent(trajectory)
+    low, high = low - scene_margin(scenario), high + scene_margin(scenario)
+    shape = np.array(_WORLD[2:])
+    half = np.max((high - low) / shape) * shape / 2.0
+    middle = (low + high) / 2.0
+    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    light_grid(axes)
+    side = float(scenario.arena_side)
+    axes.add_patch(
+        Rectangle((-side / 2, -side / 2), side, side, fill=False, edgecolor=FAINT, linewidth=0.9, zorder=0.4)
+    )
+
+
+def _set_up_seen(axes: Axes, scenario: Scenario, distances: Float[np.ndarray, "n"]) -> None:
+    reach = float(np.abs(capture_set_outline(scenario)).max())
+    half = float(np.clip(1.1 * distances.max(), 2.0 * reach, _WIDEST * reach))
+    axes.set_xlim(-half, half)
+    axes.set_ylim(-half, half)
+    light_grid(axes)
+
+
+def _draw_strips(
+    barriers: Axes, corrections: Axes, scenario: Scenario, trajectory: Trajectory
+) -> list[tuple[Axes, tuple[Artist, Artist]]]:
+    """The shield's whole trace, and over each strip a veil over what is still to come and a time mark."""
+    draw_barriers(barriers, scenario, trajectory)
+    draw_corrections(corrections, scenario, trajectory, correction_norm(scenario))
+    duration, veils = trajectory.length * float(scenario.control_period), []
+    for strip in (barriers, corrections):
+        strip.set_xlim(0.0, duration)
+        strip.yaxis.label.set_size(7)
+        strip.tick_params(labelsize=6.5)
+        veil = strip.add_patch(
+            Rectangle((0.0, 0.0), duration, 1.0, transform=strip.get_xaxis_transform(), facecolor="white",
+                      alpha=0.72, linewidth=0, zorder=5)
+        )  # fmt: skip
+        (line,) = strip.plot([0, 0], [0, 1], transform=strip.get_xaxis_transform(), color=INK, linewidth=1.0)
+        veils.append((strip, (veil, line)))
+    barriers.tick_params(labelbottom=False)
+    corrections.set_xlabel("time, s", fontsize=7, labelpad=1.0)
+    return veils
+
+
+@final
+class _Ways:
+    """The ways taken, up to any time, in the world and as every pursuer sees them."""
+
+    def __init__(self, scenario: Scenario, trajectory: Trajectory, motion: Motion):
+        self._parts = max(1, int(np.ceil(motion.period / _FINEST)))
+        self._period = motion.period
+        self.times = np.arange(motion.length * self._parts + 1) * (motion.period / self._parts)
+        self._evader, self._poses = motion.evader(self.times), motion.poses(self.times)
+        self._obstacles = motion.obstacles(self.times)
+        self._seen = relative(self._evader[:, None], self._poses)
+        self._viewers = nearest_pursuers(self._evader, self._poses)
+        correction = np.repeat(np.asarray(trajectory.intervention, float), self._parts)
+        self._corrected = np.flatnonzero(correction > 1e-6)
+        norm = correction_norm(scenario)
+        self._colours = correction_colours()(norm(correction[self._corrected]))
+
+    @property
+    def distances(self) -> Float[np.ndarray, "n"]:
+        """From the pursuer that is looked from to the evader, m."""
+        seen = self._seen[np.arange(len(self._viewers)), self._viewers]
+        return np.hypot(seen[:, 0], seen[:, 1])
+
+    def _passed(self, time: float) -> int:
+        """How many of the times are over."""
+        return int(np.searchsorted(self.times, time + 1e-9, side="right"))
+
+    def viewer(self, time: float) -> int:
+        """The pursuer from which to look."""
+        return int(self._viewers[self._passed(time) - 1])
+
+    def in_world(self, now: Instant) -> tuple[Any, ...]:
+        """What `MovingPanel.show_trails` takes, in the world."""
+        count = self._passed(now.time)
+        upto = lambda path, place: np.concatenate([path[:count], place[None]])  # noqa: E731
+        others = [
+            (upto(self._poses[:, index, :2], pose[:2]), PURSUER) for index, pose in enumerate(now.poses)
+        ]
+        others += [
+            (upto(self._obstacles[:, index], place), OBSTACLE) for index, place in enumerate(now.obstacles)
+        ]
+        evader = upto(self._evader, now.evader)
+        return evader, np.zeros((0, 2)), others, *self._pieces(self._evader, 0, count)
+
+    def seen_by(self, pursuer: int, now: Instant) -> tuple[Any, ...]:
+        """The same as this pursuer sees it, of late; what was before is faint."""
+        count = self._passed(now.time)
+        recent = max(0, count - round(_RECENT_SECONDS / self._period) * self._parts)
+        way = self._seen[:, pursuer]
+        return (
+            np.concatenate([way[recent:count], now.evader[None]]),
+            way[: recent + 1],
+            [],
+            *self._pieces(way, recent, count),
+        )
+
+    def _pieces(self, way: np.ndarray, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The pieces between two times in which the shield stepped in, with their colours."""
+        begin, end = np.searchsorted(self._corrected, [first, count - 1])
+        pieces = self._corrected[begin:end]
+        return np.stack([way[pieces], way[pieces + 1]], axis=1), self._colours[begin:end]
