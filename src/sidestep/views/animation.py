@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from PIL import Image
 
 from sidestep.trials import Trajectory
 from sidestep.views.motion import Instant, Motion, nearest_pursuers, relative
@@ -45,9 +46,10 @@ from sidestep.views.video_files import VideoError, check_video, write_video_file
 from sidestep.world import Scenario
 
 _INCHES = (8.0, 4.5)
-_WORLD, _SEEN = (0.46, 1.86, 4.72, 2.06), (5.62, 1.86, 2.06, 2.06)
-_BARRIERS, _CORRECTIONS = (0.46, 0.76, 7.22, 0.44), (0.46, 0.36, 7.22, 0.28)
+_WORLD, _SEEN = (0.42, 1.92, 4.88, 2.06), (5.74, 1.92, 2.06, 2.06)
+_BARRIERS, _CORRECTIONS = (0.42, 0.82, 7.38, 0.42), (0.42, 0.36, 7.38, 0.27)
 """Places of the axes: left, bottom, width, height in inches. Fixed, so that nothing ever jitters."""
+_TICKS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0)
 _RECENT_SECONDS = 5.0
 _FINEST = 0.025
 _WIDEST = 3.2
@@ -156,9 +158,14 @@ class Stage:
             strips = self._axes(_BARRIERS), self._axes(_CORRECTIONS)
             _set_up_world(self.world, scenario, trajectory)
             self._titles = [
-                self._text(_WORLD[0], 3.97, "The world, m", weight="bold", size=8),
-                self._text(_SEEN[0], 3.97, "", weight="bold", size=8),
+                self._text(_WORLD[0], 4.03, "The world, m", weight="bold", size=8),
+                self._text(_SEEN[0], 4.03, "", weight="bold", size=8),
             ]
+            for place, words in (
+                (_BARRIERS, "Barriers h: how far from capture and collision, m (√ scale)"),
+                (_CORRECTIONS, "How far the shield changed the velocity, m/s"),
+            ):
+                self._text(place[0], place[1] + place[3] + 0.035, words, size=6.5)
             _set_up_seen(self.seen, scenario, self._ways.distances)
             pursuit, pursuers = shield in PURSUIT_SHIELDS, len(start.poses)
             others = pursuers + len(start.obstacles)
@@ -170,10 +177,10 @@ class Stage:
             self._draw_key(len(start.obstacles) > 0)
             words = title if title is not None else shield_words(shield) if shield else ""
             self._words = words[:1].upper() + words[1:]
-            self._heading = self._text(_WORLD[0], 4.24, self._words, weight="bold", size=11)
+            self._heading = self._text(_WORLD[0], 4.26, self._words, weight="bold", size=11)
             right = _SEEN[0] + _SEEN[2]
-            self._clock = self._text(right, 4.24, "", size=9, ha="right")
-            self._answer = self._text(right - 1.35, 4.24, "", size=8, ha="right")
+            self._clock = self._text(right, 4.26, "", size=9, ha="right")
+            self._answer = self._text(right - 1.35, 4.26, "", size=8, ha="right")
             self._speed = "" if speed == 1.0 else f" (× {speed:g})"
             moving = [*self._titles[1:], self._heading, self._clock, self._answer]
             self._moving: list[tuple[Axes | None, Artist]] = [
@@ -212,7 +219,7 @@ class Stage:
         if obstacles:
             handles.insert(4, Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
         self._figure.legend(
-            handles=handles, loc="center", bbox_to_anchor=(0.5, 1.45 / _INCHES[1]), ncols=6, fontsize=6,
+            handles=handles, loc="center", bbox_to_anchor=(0.5, 1.56 / _INCHES[1]), ncols=6, fontsize=6.3,
             columnspacing=1.6, handletextpad=0.5, labelspacing=0.35, borderpad=0.0,
         )  # fmt: skip
 
@@ -226,7 +233,9 @@ class Stage:
                 axes.draw_artist(artist)
             else:
                 artist.draw(renderer)
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        # Much faster than to copy three bytes of every four.
+        drawn = Image.fromarray(np.asarray(self._canvas.buffer_rgba()))
+        return np.asarray(drawn.convert("RGB"))
 
     def _place(self, time: float, end: bool) -> None:
         now, outcome = self.motion.at(time), self._trajectory.outcome if end else None
@@ -241,8 +250,9 @@ class Stage:
             cast(Rectangle, veil).set_x(time)
             cast(Rectangle, veil).set_width(max(self.motion.duration - time, 0.0))
             cast(Line2D, line).set_xdata([time, time])
-        number = f" {pursuer + 1}" if len(now.poses) > 1 else ""
-        self._titles[1].set_text(f"The evader in the frame of pursuer{number}, m" if number else "The evader in the pursuer's frame, m")
+        several = len(now.poses) > 1
+        frame = f"the frame of pursuer {pursuer + 1}" if several else "the pursuer's frame"
+        self._titles[1].set_text(f"In {frame}, m")
         self._clock.set_text(f"{time:.2f} s{self._speed}")
         colour, words = ANSWERS[int(np.asarray(self._trajectory.status)[now.period])]
         self._answer.set_text(f"shield: {words}")
@@ -268,9 +278,13 @@ def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     light_grid(axes)
     side = float(scenario.arena_side)
-    axes.add_patch(
-        Rectangle((-side / 2, -side / 2), side, side, fill=False, edgecolor=FAINT, linewidth=0.9, zorder=0.4)
-    )
+    # Without a corner of it in view, it would be a line that says nothing.
+    if np.all(np.abs(middle) + half > side / 2):
+        axes.add_patch(
+            Rectangle(
+                (-side / 2, -side / 2), side, side, fill=False, edgecolor=FAINT, linewidth=0.9, zorder=0.4
+            )
+        )
 
 
 def _set_up_seen(axes: Axes, scenario: Scenario, distances: Float[np.ndarray, "n"]) -> None:
@@ -290,7 +304,7 @@ def _draw_strips(
     duration, veils = trajectory.length * float(scenario.control_period), []
     for strip in (barriers, corrections):
         strip.set_xlim(0.0, duration)
-        strip.yaxis.label.set_size(7)
+        strip.set_ylabel("")
         strip.tick_params(labelsize=6.5)
         veil = strip.add_patch(
             Rectangle((0.0, 0.0), duration, 1.0, transform=strip.get_xaxis_transform(), facecolor="white",
@@ -299,6 +313,12 @@ def _draw_strips(
         (line,) = strip.plot([0, 0], [0, 1], transform=strip.get_xaxis_transform(), color=INK, linewidth=1.0)
         veils.append((strip, (veil, line)))
     barriers.tick_params(labelbottom=False)
+    # Fewer than in a figure: the strip is low.
+    ticks = [tick for tick in _TICKS if tick <= barriers.get_ylim()[1]]
+    barriers.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    barriers.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=6.5, borderpad=0.1, borderaxespad=0.2
+    )
     corrections.set_xlabel("time, s", fontsize=7, labelpad=1.0)
     return veils
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
 from sidestep.views.motion import Instant
-from sidestep.views.outlines import level_outline
+from sidestep.views.outlines import LevelOutlines
 from sidestep.views.scene import capture_set_outline, to_world
 from sidestep.views.style import EVADER, INK, OBSTACLE, OUTCOME_COLOURS, PURSUER, TARGET
 from sidestep.world import Scenario
@@ -116,11 +116,11 @@ class MovingPanel:
     """Everything that is to be seen of an instant, in axes whose limits are set and stay.
 
     **Arguments:** `trails` how many ways there are to draw beside the evader's; `pursuit` which barrier's
-    levels are drawn, see `level_outline`.
+    levels are drawn, see `LevelOutlines`.
     """
 
     def __init__(self, axes: Axes, scenario: Scenario, instant: Instant, *, trails: int, pursuit: bool):
-        self.axes, self._scenario, self._pursuit = axes, scenario, pursuit
+        self.axes, self._outlines = axes, LevelOutlines(scenario, pursuit=pursuit)
         several = len(instant.poses) > 1
         (self._low,) = axes.plot([], [], color=LEVEL_COLOUR, linewidth=0.5, zorder=0.5)
         (self._zero,) = axes.plot([], [], color=INK, linewidth=1.0, zorder=2.5)
@@ -181,7 +181,7 @@ class MovingPanel:
         self._faint.set_data(*faint.T)
         for line, (way, colour) in zip(self._trails, [(evader, EVADER), *others], strict=True):
             line.set_data(*way.T)
-            line.set_color(colour)
+            line.set(color=colour, linewidth=1.0 if colour == OBSTACLE else 1.3)
         self._corrected.set_segments(corrected)
         self._corrected.set_color(colours)
 
@@ -196,15 +196,13 @@ class MovingPanel:
             dot.set_data(*place[:, None])
         self._goal.set_center((float(now.target[0]), float(now.target[1])))
         self._star.set_data(*now.target[:, None])
-        level = lambda height: level_outline(  # noqa: E731
-            self._scenario, now.poses, now.obstacles, height, pursuit=self._pursuit
-        )
-        self._zero.set_data(*level(0.0).T)
-        self._low.set_data(*np.concatenate([level(height) for height in LEVELS]).T)
+        zero, *low = (self._outlines.at(now.poses, now.obstacles, level) for level in (0.0, *LEVELS))
+        self._zero.set_data(*zero.T)
+        self._low.set_data(*np.concatenate(low).T)
         self._evader.set_data(*now.evader[:, None])
-        self._nominal.show(now.evader, now.nominal)
-        self._action.show(now.evader, now.action)
         lost = outcome in ("captured", "collided")
+        for arrow, velocity in ((self._nominal, now.nominal), (self._action, now.action)):
+            arrow.show(now.evader, np.zeros(2) if lost else velocity)
         self._lost.set_data(*(now.evader[:, None] if lost else np.zeros((2, 0))))
         self._lost.set_color(OUTCOME_COLOURS.get(outcome or "", INK))
         self._lost.set_markeredgecolor("white")
@@ -223,6 +221,6 @@ class MovingPanel:
         edge = centre + offset / np.max(np.abs(offset) / half) * 0.95
         self._beyond.set_data(*edge[:, None])
         self._beyond.set_marker((3, 0, np.degrees(np.arctan2(offset[1], offset[0])) - 90.0))
-        words = centre + 0.84 * (edge - centre)
+        words = centre + 0.76 * (edge - centre)
         self._distance.set_position((float(words[0]), float(words[1])))
         self._distance.set_text(f"{np.hypot(*evader):.2f} m")

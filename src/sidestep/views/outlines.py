@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
@@ -38,36 +39,41 @@ def pursuer_heights(
     return apart - float(scenario.capture_distance)
 
 
-def level_outline(
-    scenario: Scenario,
-    poses: Float[np.ndarray, "m 3"],
-    obstacles: Float[np.ndarray, "k 2"],
-    level: float,
-    *,
-    pursuit: bool,
-) -> Float[np.ndarray, "n 2"]:
-    """Where the least barrier over all robots is `level` (m): closed outlines, NaN between them.
+@final
+class LevelOutlines:
+    """Where the least barrier over all robots has a certain value, all but the evader held in place.
 
-    Around each robot the level of its own barrier has the shape of its level 0, only larger by as much; the
-    parts of it at which another barrier is lower are left out.
+    Around each robot the level c > 0 of its own barrier has the shape of its level 0, only larger by c; the
+    parts of it at which another barrier is lower are left out. `pursuit` as for `pursuer_heights`.
     """
-    capture, collision = float(scenario.capture_distance), float(scenario.collision_distance)
-    angles = np.linspace(0.0, 2.0 * np.pi, _POINTS)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    shape = _dense(capture_set_outline(scenario, _POINTS)) / capture if pursuit else circle
-    outlines = [to_world((capture + level) * shape, pose) for pose in poses]
-    outlines += [centre + (collision + level) * circle for centre in obstacles]
-    for one, outline in enumerate(outlines):
-        outside = np.ones(len(outline), bool)
-        for other, pose in enumerate(poses):
-            if other != one:
-                outside &= pursuer_heights(scenario, outline, pose, pursuit=pursuit) >= level
-        for other, centre in enumerate(obstacles, start=len(poses)):
-            if other != one:
-                outside &= np.hypot(*(outline - centre).T) - collision >= level
-        outline[~outside] = np.nan
-    gap = np.full((1, 2), np.nan)
-    return np.concatenate([part for outline in outlines for part in (outline, gap)])
+
+    def __init__(self, scenario: Scenario, *, pursuit: bool):
+        self._scenario, self._pursuit = scenario, pursuit
+        self._capture, self._collision = float(scenario.capture_distance), float(scenario.collision_distance)
+        angles = np.linspace(0.0, 2.0 * np.pi, _POINTS)
+        self._circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        self._shape = self._circle
+        if pursuit:
+            self._shape = _dense(capture_set_outline(scenario, _POINTS)) / self._capture
+
+    def at(
+        self, poses: Float[np.ndarray, "m 3"], obstacles: Float[np.ndarray, "k 2"], level: float
+    ) -> Float[np.ndarray, "n 2"]:
+        """The level (m) around pursuers and obstacles: closed outlines, NaN where they are cut and between."""
+        outlines = [to_world((self._capture + level) * self._shape, pose) for pose in poses]
+        outlines += [centre + (self._collision + level) * self._circle for centre in obstacles]
+        for one, outline in enumerate(outlines):
+            outside = np.ones(len(outline), bool)
+            for other, pose in enumerate(poses):
+                if other != one:
+                    heights = pursuer_heights(self._scenario, outline, pose, pursuit=self._pursuit)
+                    outside &= heights >= level
+            for other, centre in enumerate(obstacles, start=len(poses)):
+                if other != one:
+                    outside &= np.hypot(*(outline - centre).T) - self._collision >= level
+            outline[~outside] = np.nan
+        gap = np.full((1, 2), np.nan)
+        return np.concatenate([part for outline in outlines for part in (outline, gap)])
 
 
 def _dense(outline: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
