@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast, final
 
@@ -18,7 +18,7 @@ from PIL import Image
 
 from sidestep.trials import Trajectory
 from sidestep.views.motion import Instant, Motion, nearest_pursuers, relative
-from sidestep.views.moving_panel import LEVEL_COLOUR, LEVELS, NOMINAL_DASHES, MovingPanel
+from sidestep.views.moving_panel import LEVEL_COLOUR, NOMINAL_DASHES, MovingPanel
 from sidestep.views.outlines import PURSUIT_SHIELDS
 from sidestep.views.scene import capture_set_outline, correction_colours
 from sidestep.views.style import (
@@ -55,6 +55,8 @@ _FINEST = 0.025
 _WIDEST = 3.2
 """The pursuer's frame shows at most so many times the reach of its capture set."""
 _SHORTEST, _MOST_PIXELS = 160, 4096
+LEVELS = (0.1, 0.2, 0.3)
+"""Levels of the barrier (m) that are drawn beside its level 0."""
 _RATES = {".mp4": 30, ".gif": 20, ".webp": 20}
 _WIDTHS = {".mp4": 1280, ".gif": 720, ".webp": 720}
 
@@ -70,6 +72,7 @@ def animate(
     rate: int | None = None,
     width: int | None = None,
     hold: float = 1.5,
+    levels: Sequence[float] = LEVELS,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write an episode as a video: .mp4 (H.264), .gif or .webp, as the suffix of `path` says.
@@ -81,7 +84,8 @@ def animate(
     **Arguments:** `shield` its name, for words and for which barrier's levels are drawn; `title` instead of
     the shield's; `speed` how many times faster than it was; `rate` pictures per second (30; 20 for .gif and
     .webp); `width` in pixels, of which 9/16 are the height (1280; 720 for .gif and .webp); `hold` how long
-    (s) the end stays; `progress` is told how many pictures are done, and of how many.
+    (s) the end stays; `levels` (m, above 0) of the barrier to draw beside level 0: none make a .gif or
+    .webp half as large; `progress` is told how many pictures are done, and of how many.
 
     **Returns** the path. A file that exists is replaced when the new one is complete; an interruption leaves
     the old one, or nothing. **Raises** `VideoError` before any work when the file cannot be written as asked
@@ -91,8 +95,8 @@ def animate(
     suffix = path.suffix.lower()
     rate = _RATES[suffix] if rate is None else rate
     width = _WIDTHS[suffix] if width is None else width
-    check_numbers(speed, rate, width, hold)
-    stage = Stage(scenario, trajectory, shield=shield, title=title, speed=speed, width=width)
+    check_numbers(speed, rate, width, hold, levels)
+    stage = Stage(scenario, trajectory, shield=shield, title=title, speed=speed, width=width, levels=levels)
     duration = stage.motion.duration
     times = [*np.arange(0.0, duration - 1e-9, speed / rate), duration]
 
@@ -111,7 +115,9 @@ def animate(
     return write_video_file(path, pictures(), rate, hold=hold, samples=chosen_from)
 
 
-def check_numbers(speed: float, rate: int, width: int, hold: float = 0.0) -> None:
+def check_numbers(
+    speed: float, rate: int, width: int, hold: float = 0.0, levels: Sequence[float] = LEVELS
+) -> None:
     """Raises `VideoError` when a video cannot have these numbers."""
     if not (np.isfinite(speed) and speed > 0.0):
         raise VideoError(f"speed = {speed}: it must be greater than 0")
@@ -121,6 +127,8 @@ def check_numbers(speed: float, rate: int, width: int, hold: float = 0.0) -> Non
         raise VideoError(f"width = {width}: it must be {_SHORTEST} to {_MOST_PIXELS} pixels")
     if not (np.isfinite(hold) and hold >= 0.0):
         raise VideoError(f"hold = {hold}: it must be 0 s or more")
+    if not all(np.isfinite(level) and level > 0.0 for level in levels):
+        raise VideoError(f"levels = {tuple(levels)}: each must be greater than 0 m")
 
 
 @final
@@ -141,6 +149,7 @@ class Stage:
         title: str | None = None,
         speed: float = 1.0,
         width: int = 1280,
+        levels: Sequence[float] = LEVELS,
     ):
         if trajectory.length < 1:
             raise VideoError("the episode has no control period to show")
@@ -170,11 +179,11 @@ class Stage:
             pursuit, pursuers = shield in PURSUIT_SHIELDS, len(start.poses)
             others = pursuers + len(start.obstacles)
             self._panels = (
-                MovingPanel(self.world, scenario, start, trails=others, pursuit=pursuit),
-                MovingPanel(self.seen, scenario, start, trails=0, pursuit=pursuit),
+                MovingPanel(self.world, scenario, start, trails=others, pursuit=pursuit, levels=levels),
+                MovingPanel(self.seen, scenario, start, trails=0, pursuit=pursuit, levels=levels),
             )
             self._veils = _draw_strips(*strips, scenario, trajectory)
-            self._draw_key(len(start.obstacles) > 0)
+            self._draw_key(len(start.obstacles) > 0, levels)
             words = title if title is not None else shield_words(shield) if shield else ""
             self._words = words[:1].upper() + words[1:]
             self._heading = self._text(_WORLD[0], 4.26, self._words, weight="bold", size=11)
@@ -182,16 +191,16 @@ class Stage:
             self._clock = self._text(right, 4.26, "", size=9, ha="right")
             self._answer = self._text(right - 1.35, 4.26, "", size=8, ha="right")
             self._speed = "" if speed == 1.0 else f" (× {speed:g})"
-            moving = [*self._titles[1:], self._heading, self._clock, self._answer]
-            self._moving: list[tuple[Axes | None, Artist]] = [
+            self._labels = (*self._titles[1:], self._heading, self._answer)
+            self._moving: list[tuple[Axes, Artist]] = [
                 (panel.axes, artist) for panel in self._panels for artist in panel.artists
             ]
             self._moving += [(strip, veil) for strip, veils in self._veils for veil in veils]
-            self._moving += [(None, words) for words in moving]
-            for _, artist in self._moving:
+            for artist in (*(artist for _, artist in self._moving), *self._labels, self._clock):
                 artist.set_animated(True)
             self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._labelled: tuple[list[str], Any] = ([], None)
 
     def _axes(self, place: tuple[float, float, float, float]) -> Axes:
         across, up = _INCHES
@@ -199,11 +208,9 @@ class Stage:
         return self._figure.add_axes((left / across, bottom / up, width / across, height / up))
 
     def _text(self, x: float, y: float, words: str, *, size: float, **look: Any) -> Any:
-        return self._figure.text(
-            x / _INCHES[0], y / _INCHES[1], words, va="baseline", fontsize=size, **look
-        )
+        return self._figure.text(x / _INCHES[0], y / _INCHES[1], words, va="baseline", fontsize=size, **look)
 
-    def _draw_key(self, obstacles: bool) -> None:
+    def _draw_key(self, obstacles: bool, levels: Sequence[float]) -> None:
         handles: list[Any] = [
             Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
             Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
@@ -211,11 +218,13 @@ class Stage:
             Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
             Line2D([], [], color=PURSUER, linewidth=0.9, linestyle=(0, (3, 2)), label="capture set K"),
             Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
-            Line2D([], [], color=LEVEL_COLOUR, linewidth=0.6, label=f"h = {', '.join(map(str, LEVELS))} m"),
             Line2D([], [], color=EVADER, linewidth=1.5, label="velocity driven"),
             Line2D([], [], color=INK, linewidth=1.5, linestyle=NOMINAL_DASHES, label="velocity wished"),
             Patch(facecolor=correction_colours()(0.6), label="shield corrects"),
         ]
+        if levels:
+            told = f"h = {', '.join(f'{level:g}' for level in levels)} m"
+            handles.insert(6, Line2D([], [], color=LEVEL_COLOUR, linewidth=0.6, label=told))
         if obstacles:
             handles.insert(4, Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
         self._figure.legend(
@@ -226,16 +235,23 @@ class Stage:
     def picture(self, time: float, *, end: bool = False) -> UInt8[np.ndarray, "height width 3"]:
         """The picture at a time (s); with the outcome if this is the `end`."""
         self._place(time, end)
-        self._canvas.restore_region(self._still)
-        renderer = self._canvas.get_renderer()
+        self._canvas.restore_region(self._with_labels())
         for axes, artist in self._moving:
-            if axes is not None:
-                axes.draw_artist(artist)
-            else:
-                artist.draw(renderer)
+            axes.draw_artist(artist)
+        self._clock.draw(self._canvas.get_renderer())
         # Much faster than to copy three bytes of every four.
         drawn = Image.fromarray(np.asarray(self._canvas.buffer_rgba()))
         return np.asarray(drawn.convert("RGB"))
+
+    def _with_labels(self) -> Any:
+        """What never changes, with the words that seldom change: text is slow to draw."""
+        words = [label.get_text() for label in self._labels]
+        if words != self._labelled[0]:
+            self._canvas.restore_region(self._still)
+            for label in self._labels:
+                label.draw(self._canvas.get_renderer())
+            self._labelled = words, self._canvas.copy_from_bbox(self._figure.bbox)
+        return self._labelled[1]
 
     def _place(self, time: float, end: bool) -> None:
         now, outcome = self.motion.at(time), self._trajectory.outcome if end else None

@@ -20,7 +20,6 @@ from sidestep.views.scene import capture_set_outline, to_world
 from sidestep.views.style import EVADER, INK, OBSTACLE, OUTCOME_COLOURS, PURSUER, TARGET
 from sidestep.world import Scenario
 
-LEVELS = (0.1, 0.2, 0.3)
 NOMINAL_DASHES = (0, (2.2, 1.2))
 LEVEL_COLOUR = "#9A9A9A"
 _CIRCLE = np.array([[np.cos(angle), np.sin(angle)] for angle in np.linspace(0.0, 2.0 * np.pi, 73)])
@@ -69,7 +68,7 @@ class _Pursuer:
         # A wheel as thick as it is in proportion to the axle, but never too thin to be seen.
         length = float(np.clip(0.5 * axle, 0.05, 0.12))
         wheel = 0.5 * length * np.array([[-1.0, -0.32], [1.0, -0.32], [1.0, 0.32], [-1.0, 0.32]])
-        self._wheels = [wheel + [0.0, side * axle] for side in (-1.0, 1.0)]
+        self._wheels = [wheel + np.array([0.0, side * axle]) for side in (-1.0, 1.0)]
         self._axle = np.array([[0.0, -axle], [0.0, axle]])
         self._body = float(np.clip(0.7 * axle, 0.09, 0.14)) * _BODY
         self._parts: list[tuple[Any, np.ndarray]] = []
@@ -116,16 +115,28 @@ class MovingPanel:
     """Everything that is to be seen of an instant, in axes whose limits are set and stay.
 
     **Arguments:** `trails` how many ways there are to draw beside the evader's; `pursuit` which barrier's
-    levels are drawn, see `LevelOutlines`.
+    levels are drawn, see `LevelOutlines`, and `levels` (m) which beside 0.
     """
 
-    def __init__(self, axes: Axes, scenario: Scenario, instant: Instant, *, trails: int, pursuit: bool):
-        self.axes, self._outlines = axes, LevelOutlines(scenario, pursuit=pursuit)
+    def __init__(
+        self,
+        axes: Axes,
+        scenario: Scenario,
+        instant: Instant,
+        *,
+        trails: int,
+        pursuit: bool,
+        levels: Sequence[float],
+    ):
+        self.axes, self._levels = axes, levels
+        self._outlines = LevelOutlines(scenario, pursuit=pursuit)
         several = len(instant.poses) > 1
         (self._low,) = axes.plot([], [], color=LEVEL_COLOUR, linewidth=0.5, zorder=0.5)
         (self._zero,) = axes.plot([], [], color=INK, linewidth=1.0, zorder=2.5)
         reach = float(scenario.reach_distance)
-        self._goal = axes.add_patch(Circle((0, 0), reach, facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2))
+        self._goal = axes.add_patch(
+            Circle((0, 0), reach, facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2)
+        )
         (self._star,) = axes.plot(
             [], [], "*", color=TARGET, markersize=9, markeredgecolor="white", markeredgewidth=0.6, zorder=5
         )
@@ -166,7 +177,10 @@ class MovingPanel:
         parts += [part for rock in self._rocks for part in rock]
         parts += [part for pursuer in self._pursuers for part in pursuer.artists]
         parts += [self._corrected, self._evader, self._lost, self._beyond, self._distance]
-        return [*parts, *(part for arrow in (self._nominal, self._action) for part in (arrow.shaft, arrow.head))]
+        return [
+            *parts,
+            *(part for arrow in (self._nominal, self._action) for part in (arrow.shaft, arrow.head)),
+        ]
 
     def show_trails(
         self,
@@ -196,9 +210,9 @@ class MovingPanel:
             dot.set_data(*place[:, None])
         self._goal.set_center((float(now.target[0]), float(now.target[1])))
         self._star.set_data(*now.target[:, None])
-        zero, *low = (self._outlines.at(now.poses, now.obstacles, level) for level in (0.0, *LEVELS))
+        zero, *low = (self._outlines.at(now.poses, now.obstacles, level) for level in (0.0, *self._levels))
         self._zero.set_data(*zero.T)
-        self._low.set_data(*np.concatenate(low).T)
+        self._low.set_data(*np.concatenate([*low, np.zeros((0, 2))]).T)
         self._evader.set_data(*now.evader[:, None])
         lost = outcome in ("captured", "collided")
         for arrow, velocity in ((self._nominal, now.nominal), (self._action, now.action)):

@@ -30,13 +30,17 @@ def pursuer_heights(
     The game's is the signed distance from the capture set K, which is |x| cos S + |y| sin S - l in front of
     the pursuer and behind it, and |z| - l aside.
     """
+    usable = float(scenario.usable_angle) if pursuit else None
+    return _heights(points, pose, float(scenario.capture_distance), usable)
+
+
+def _heights(points: np.ndarray, pose: np.ndarray, capture: float, usable: float | None) -> np.ndarray:
     ahead, aside = np.moveaxis(np.abs(relative(points, pose)), -1, 0)
-    usable = float(scenario.usable_angle)
     apart = np.hypot(ahead, aside)
-    if pursuit:
+    if usable is not None:
         slanted = ahead * np.cos(usable) + aside * np.sin(usable)
         apart = np.where(aside * np.cos(usable) < ahead * np.sin(usable), slanted, apart)
-    return apart - float(scenario.capture_distance)
+    return apart - capture
 
 
 @final
@@ -48,7 +52,7 @@ class LevelOutlines:
     """
 
     def __init__(self, scenario: Scenario, *, pursuit: bool):
-        self._scenario, self._pursuit = scenario, pursuit
+        self._usable = float(scenario.usable_angle) if pursuit else None
         self._capture, self._collision = float(scenario.capture_distance), float(scenario.collision_distance)
         angles = np.linspace(0.0, 2.0 * np.pi, _POINTS)
         self._circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -59,15 +63,14 @@ class LevelOutlines:
     def at(
         self, poses: Float[np.ndarray, "m 3"], obstacles: Float[np.ndarray, "k 2"], level: float
     ) -> Float[np.ndarray, "n 2"]:
-        """The level (m) around pursuers and obstacles: closed outlines, NaN where they are cut and between."""
+        """The level (m) around pursuers and obstacles: closed outlines, NaN between and where they are cut."""
         outlines = [to_world((self._capture + level) * self._shape, pose) for pose in poses]
         outlines += [centre + (self._collision + level) * self._circle for centre in obstacles]
         for one, outline in enumerate(outlines):
             outside = np.ones(len(outline), bool)
             for other, pose in enumerate(poses):
                 if other != one:
-                    heights = pursuer_heights(self._scenario, outline, pose, pursuit=self._pursuit)
-                    outside &= heights >= level
+                    outside &= _heights(outline, pose, self._capture, self._usable) >= level
             for other, centre in enumerate(obstacles, start=len(poses)):
                 if other != one:
                     outside &= np.hypot(*(outline - centre).T) - self._collision >= level
