@@ -54,7 +54,7 @@ _RECENT_SECONDS = 5.0
 _FINEST = 0.025
 _WIDEST = 3.2
 """The pursuer's frame shows at most so many times the reach of its capture set."""
-_SHORTEST, _MOST_PIXELS = 160, 4096
+_NARROWEST, _WIDEST_PIXELS = 160, 4096
 LEVELS = (0.1, 0.2, 0.3)
 """Levels of the barrier (m) that are drawn beside its level 0."""
 _RATES = {".mp4": 30, ".gif": 20, ".webp": 20}
@@ -95,7 +95,7 @@ def animate(
     suffix = path.suffix.lower()
     rate = _RATES[suffix] if rate is None else rate
     width = _WIDTHS[suffix] if width is None else width
-    check_numbers(speed, rate, width, hold, levels)
+    check_numbers(path, speed=speed, rate=rate, width=width, hold=hold, levels=levels)
     stage = Stage(scenario, trajectory, shield=shield, title=title, speed=speed, width=width, levels=levels)
     duration = stage.motion.duration
     times = [*np.arange(0.0, duration - 1e-9, speed / rate), duration]
@@ -116,15 +116,23 @@ def animate(
 
 
 def check_numbers(
-    speed: float, rate: int, width: int, hold: float = 0.0, levels: Sequence[float] = LEVELS
+    path: Path,
+    *,
+    speed: float,
+    rate: int | None = None,
+    width: int | None = None,
+    hold: float = 0.0,
+    levels: Sequence[float] = LEVELS,
 ) -> None:
-    """Raises `VideoError` when a video cannot have these numbers."""
+    """**Raises** `VideoError` when `animate` could not take these arguments for this file."""
     if not (np.isfinite(speed) and speed > 0.0):
         raise VideoError(f"speed = {speed}: it must be greater than 0")
-    if not 1 <= rate <= 100:
-        raise VideoError(f"rate = {rate}: it must be 1 to 100 pictures per second")
-    if not _SHORTEST <= width <= _MOST_PIXELS:
-        raise VideoError(f"width = {width}: it must be {_SHORTEST} to {_MOST_PIXELS} pixels")
+    # Browsers slow down a GIF that is faster.
+    most = 50 if path.suffix.lower() == ".gif" else 120
+    if rate is not None and not 1 <= rate <= most:
+        raise VideoError(f"rate = {rate}: it must be 1 to {most} pictures per second")
+    if width is not None and not _NARROWEST <= width <= _WIDEST_PIXELS:
+        raise VideoError(f"width = {width}: it must be {_NARROWEST} to {_WIDEST_PIXELS} pixels")
     if not (np.isfinite(hold) and hold >= 0.0):
         raise VideoError(f"hold = {hold}: it must be 0 s or more")
     if not all(np.isfinite(level) and level > 0.0 for level in levels):

@@ -18,7 +18,7 @@ def turn_between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def relative(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """z = R(-theta)(p - p_d): points (..., 2) of the world (m) in frames (..., 3) of x, y (m), heading (rad)."""
+    """z = R(-theta)(p - p_d): points (..., 2) of the world in frames (..., 3) of x, y (m), heading (rad)."""
     return turned_back(points - poses[..., :2], poses[..., 2])
 
 

@@ -39,9 +39,10 @@ class _Arrow:
         (self.shaft,) = axes.plot(
             [], [], color=colour, linewidth=1.5, linestyle=dashes, zorder=zorder, solid_capstyle="butt"
         )
-        self.head = axes.add_patch(
-            Polygon(np.zeros((3, 2)), facecolor=colour, edgecolor="white", linewidth=0.4, zorder=zorder)
+        self.head = Polygon(
+            np.zeros((3, 2)), facecolor=colour, edgecolor="white", linewidth=0.4, zorder=zorder
         )
+        axes.add_patch(self.head)
 
     def show(self, place: np.ndarray, velocity: np.ndarray) -> None:
         """Point along `velocity` (m/s); nothing is shown of a standstill."""
@@ -74,7 +75,8 @@ class _Pursuer:
         self._parts: list[tuple[Any, np.ndarray]] = []
 
         def area(shape: np.ndarray, zorder: float, **look: Any) -> None:
-            patch = axes.add_patch(Polygon(shape, closed=True, zorder=zorder, **look))
+            patch = Polygon(shape, closed=True, zorder=zorder, **look)
+            axes.add_patch(patch)
             self._parts.append((patch, shape))
 
         def line(shape: np.ndarray, zorder: float, **look: Any) -> None:
@@ -134,9 +136,8 @@ class MovingPanel:
         (self._low,) = axes.plot([], [], color=LEVEL_COLOUR, linewidth=0.5, zorder=0.5)
         (self._zero,) = axes.plot([], [], color=INK, linewidth=1.0, zorder=2.5)
         reach = float(scenario.reach_distance)
-        self._goal = axes.add_patch(
-            Circle((0, 0), reach, facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2)
-        )
+        self._goal = Circle((0, 0), reach, facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2)
+        axes.add_patch(self._goal)
         (self._star,) = axes.plot(
             [], [], "*", color=TARGET, markersize=9, markeredgecolor="white", markeredgewidth=0.6, zorder=5
         )
@@ -146,7 +147,9 @@ class MovingPanel:
             area = Circle((0, 0), collision, facecolor=OBSTACLE, alpha=0.18, linewidth=0, zorder=1)
             edge = Circle((0, 0), collision, fill=False, edgecolor=OBSTACLE, linewidth=0.8, zorder=2)
             (dot,) = axes.plot([], [], "o", color=OBSTACLE, markersize=4, zorder=5)
-            self._rocks.append((axes.add_patch(area), axes.add_patch(edge), dot))
+            axes.add_patch(area)
+            axes.add_patch(edge)
+            self._rocks.append((area, edge, dot))
         self._pursuers = [
             _Pursuer(axes, scenario, str(number + 1) if several else "")
             for number in range(len(instant.poses))
@@ -188,7 +191,7 @@ class MovingPanel:
         faint: Float[np.ndarray, "m 2"],
         others: Sequence[tuple[Float[np.ndarray, "n 2"], str]],
         corrected: Sequence[np.ndarray],
-        colours: Sequence[Any] | np.ndarray,
+        colours: Any,
     ) -> None:
         """Draw ways: the evader's, an older part of it faintly, those of others with their colours, and the
         pieces of the evader's on which the shield stepped in, with the colours of the corrections."""

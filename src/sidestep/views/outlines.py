@@ -63,7 +63,7 @@ class LevelOutlines:
     def at(
         self, poses: Float[np.ndarray, "m 3"], obstacles: Float[np.ndarray, "k 2"], level: float
     ) -> Float[np.ndarray, "n 2"]:
-        """The level (m) around pursuers and obstacles: closed outlines, NaN between and where they are cut."""
+        """The level (m) around pursuers and obstacles: closed, NaN between them and where they are cut."""
         outlines = [to_world((self._capture + level) * self._shape, pose) for pose in poses]
         outlines += [centre + (self._collision + level) * self._circle for centre in obstacles]
         for one, outline in enumerate(outlines):

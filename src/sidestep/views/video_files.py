@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain, islice, repeat
@@ -33,7 +34,7 @@ class VideoError(ValueError):
 def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
     """The path, if a video can be written there: asked before any work is done.
 
-    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder, for a file that
+    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot be written to, for a file that
     exists unless `overwrite`, and when the package that writes it is not installed.
     """
     path = Path(path)
@@ -41,6 +42,9 @@ def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
         raise VideoError(f"{path} must end in one of {', '.join(SUFFIXES)}: it says what to write")
     if path.is_dir():
         raise VideoError(f"{path} is a folder; give the video a name in it")
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise VideoError(f"{path} cannot be written: {folder} is no folder that one can write to")
     if path.exists() and not overwrite:
         raise VideoError(f"{path} exists already; give the video another name")
     if path.suffix.lower() == ".mp4":
@@ -50,12 +54,15 @@ def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
     return path
 
 
-def load_av() -> Any:
-    """The module `av` (PyAV), which writes MP4 files. **Raises** `VideoError` when it is not installed."""
+def load_av(extra: str = "video") -> Any:
+    """The module `av` (PyAV), which writes MP4 files.
+
+    **Raises** `VideoError` when it is not installed; it names the extra that installs it.
+    """
     try:
         return importlib.import_module("av")
     except ModuleNotFoundError as error:
-        raise VideoError(f"writing an MP4 video needs PyAV: {_INSTALL}") from error
+        raise VideoError(f"writing an MP4 video needs PyAV: pip install 'sidestep[{extra}]'") from error
 
 
 def _load_pillow(suffix: str) -> Any:
