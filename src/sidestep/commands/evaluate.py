@@ -96,8 +96,7 @@ def run(command: Evaluate, console: Console) -> int:
     if command.film.video is not None:
         number = _chosen(command.video_episode, evaluation)
         trajectory = rollout(scenario, policy, shield, pursuer, episode_key(command.seed, number))
-        console.print(f"Episode {number} in motion:", highlight=False)
-        write_video(command.film, scenario, trajectory, shield, console)
+        write_video(command.film, scenario, trajectory, shield, console, f"episode {number}")
     return 0
 
 

@@ -51,7 +51,9 @@ def check_options(options: Video) -> None:
     )
 
 
-def write_video(options: Video, scenario: Any, trajectory: Any, shield: str, console: Console) -> None:
+def write_video(
+    options: Video, scenario: Any, trajectory: Any, shield: str, console: Console, what: str = "the episode"
+) -> None:
     """Animate an episode if that was asked for, and say where."""
     if options.video is None:
         return
@@ -70,4 +72,4 @@ def write_video(options: Video, scenario: Any, trajectory: Any, shield: str, con
             progress=show,
         )
     outcome = trajectory.outcome.replace("_", " ")
-    console.print(f"Video ({outcome}): {path}", highlight=False, soft_wrap=True)
+    console.print(f"Video of {what} ({outcome}): {path}", highlight=False, soft_wrap=True)

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from sidestep.trials import Trajectory
@@ -98,7 +99,7 @@ def animate(
     check_numbers(path, speed=speed, rate=rate, width=width, hold=hold, levels=levels)
     stage = Stage(scenario, trajectory, shield=shield, title=title, speed=speed, width=width, levels=levels)
     duration = stage.motion.duration
-    times = [*np.arange(0.0, duration - 1e-9, speed / rate), duration]
+    times = [*np.arange(0.0, duration - 1e-6, speed / rate), duration]
 
     def pictures() -> Iterator[np.ndarray]:
         for number, time in enumerate(times, start=1):
@@ -175,8 +176,8 @@ class Stage:
             strips = self._axes(_BARRIERS), self._axes(_CORRECTIONS)
             _set_up_world(self.world, scenario, trajectory)
             self._titles = [
-                self._text(_WORLD[0], 4.03, "The world, m", weight="bold", size=8),
-                self._text(_SEEN[0], 4.03, "", weight="bold", size=8),
+                self._text(_WORLD[0], 4.03, "The world, m", weight="bold", size=8.0),
+                self._text(_SEEN[0], 4.03, "", weight="bold", size=8.0),
             ]
             for place, words in (
                 (_BARRIERS, "Barriers h: how far from capture and collision, m (√ scale)"),
@@ -194,10 +195,10 @@ class Stage:
             self._draw_key(len(start.obstacles) > 0, levels)
             words = title if title is not None else shield_words(shield) if shield else ""
             self._words = words[:1].upper() + words[1:]
-            self._heading = self._text(_WORLD[0], 4.26, self._words, weight="bold", size=11)
+            self._heading = self._text(_WORLD[0], 4.26, self._words, weight="bold", size=11.0)
             right = _SEEN[0] + _SEEN[2]
-            self._clock = self._text(right, 4.26, "", size=9, ha="right")
-            self._answer = self._text(right - 1.35, 4.26, "", size=8, ha="right")
+            self._clock = self._text(right, 4.26, "", size=9.0, ha="right")
+            self._answer = self._text(right - 1.35, 4.26, "", size=8.0, ha="right")
             self._speed = "" if speed == 1.0 else f" (× {speed:g})"
             self._labels = (*self._titles[1:], self._heading, self._answer)
             self._moving: list[tuple[Axes, Artist]] = [
@@ -300,7 +301,7 @@ def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
     middle = (low + high) / 2.0
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
-    light_grid(axes)
+    _round_ticks(axes, 8, 6)
     side = float(scenario.arena_side)
     # Without a corner of it in view, it would be a line that says nothing.
     if np.all(np.abs(middle) + half > side / 2):
@@ -316,6 +317,13 @@ def _set_up_seen(axes: Axes, scenario: Scenario, distances: Float[np.ndarray, "n
     half = float(np.clip(1.1 * distances.max(), 2.0 * reach, _WIDEST * reach))
     axes.set_xlim(-half, half)
     axes.set_ylim(-half, half)
+    _round_ticks(axes, 4, 6)
+
+
+def _round_ticks(axes: Axes, across: int, up: int) -> None:
+    """Few digits, for which there is room at the left."""
+    for axis, most in ((axes.xaxis, across), (axes.yaxis, up)):
+        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
     light_grid(axes)
 
 

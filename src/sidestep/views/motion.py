@@ -11,8 +11,10 @@ from jaxtyping import Float
 from sidestep.trials import Trajectory
 from sidestep.world import Scenario
 
+_Angles = np.ndarray | np.floating
 
-def turn_between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+
+def turn_between(before: _Angles, after: _Angles) -> _Angles:
     """The angle (rad) from one heading to another the short way round, in [-pi, pi)."""
     return (after - before + np.pi) % (2.0 * np.pi) - np.pi
 
@@ -22,7 +24,7 @@ def relative(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return turned_back(points - poses[..., :2], poses[..., 2])
 
 
-def turned_back(vectors: np.ndarray, headings: np.ndarray) -> np.ndarray:
+def turned_back(vectors: np.ndarray, headings: _Angles) -> np.ndarray:
     """Vectors (..., 2) of the world along the axes of frames with these headings (rad)."""
     cosine, sine = np.cos(headings), np.sin(headings)
     x, y = vectors[..., 0], vectors[..., 1]
@@ -49,7 +51,7 @@ class Instant:
 
     def seen_from(self, pose: Float[np.ndarray, "3"]) -> Instant:
         """The same with this pose as the origin and its heading as the x axis."""
-        headings = turn_between(pose[2], self.poses[:, 2])
+        headings = np.asarray(turn_between(pose[2], self.poses[:, 2]))
         return replace(
             self,
             evader=relative(self.evader, pose),
@@ -105,7 +107,7 @@ class Motion:
         """Where the pursuers are, and head, at these times (s)."""
         index, share = self._split(times)
         before, after, share = self._poses[index], self._poses[index + 1], share[:, None]
-        turn = turn_between(before[..., 2], after[..., 2])
+        turn = np.asarray(turn_between(before[..., 2], after[..., 2]))
         reach = share * np.sinc(share * turn / (2.0 * np.pi)) / np.sinc(turn / (2.0 * np.pi))
         way = turned_back(after[..., :2] - before[..., :2], (1.0 - share) * turn / 2.0)
         places = before[..., :2] + reach[..., None] * way

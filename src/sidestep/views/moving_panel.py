@@ -190,8 +190,8 @@ class MovingPanel:
         evader: Float[np.ndarray, "n 2"],
         faint: Float[np.ndarray, "m 2"],
         others: Sequence[tuple[Float[np.ndarray, "n 2"], str]],
-        corrected: Sequence[np.ndarray],
-        colours: Any,
+        corrected: Float[np.ndarray, "k 2 2"],
+        colours: Float[np.ndarray, "k 4"],
     ) -> None:
         """Draw ways: the evader's, an older part of it faintly, those of others with their colours, and the
         pieces of the evader's on which the shield stepped in, with the colours of the corrections."""
@@ -199,8 +199,8 @@ class MovingPanel:
         for line, (way, colour) in zip(self._trails, [(evader, EVADER), *others], strict=True):
             line.set_data(*way.T)
             line.set(color=colour, linewidth=1.0 if colour == OBSTACLE else 1.3)
-        self._corrected.set_segments(corrected)
-        self._corrected.set_color(colours)
+        self._corrected.set_segments(list(corrected))
+        self._corrected.set_color(list(map(tuple, colours)))
 
     def show(self, now: Instant, outcome: str | None = None) -> None:
         """Put everything where it is now; with the `outcome` of the episode at its end."""

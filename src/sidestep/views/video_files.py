@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain, islice, repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import UInt8
@@ -34,8 +34,9 @@ class VideoError(ValueError):
 def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
     """The path, if a video can be written there: asked before any work is done.
 
-    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot be written to, for a file that
-    exists unless `overwrite`, and when the package that writes it is not installed.
+    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot
+    be written to, for a file that exists unless `overwrite`, and when the package that writes it is not
+    installed.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -110,9 +111,9 @@ def write_video_file(
         if path.suffix.lower() == ".mp4":
             _write_mp4(beside, chain([first], stream), first.shape[:2], rate, hold)
         else:
-            colours = _palette([first] if samples is None else samples)
+            palette = _Palette([first] if samples is None else samples)
             write = _write_gif if path.suffix.lower() == ".gif" else _write_webp
-            write(beside, chain([first], stream), colours, rate, hold)
+            write(beside, chain([first], stream), palette, rate, hold)
     return path
 
 
@@ -142,23 +143,26 @@ def _as_frame(av: Any, picture: Any, space: Any) -> Any:
     return frame.reformat(format="yuv420p", dst_colorspace=space, dst_color_range=1)
 
 
-def _write_gif(path: Path, pictures: Pictures, colours: np.ndarray, rate: int, hold: float) -> None:
-    palette, durations = _as_image(colours), _Durations(rate, hold, unit=10)
+def _write_gif(path: Path, pictures: Pictures, palette: _Palette, rate: int, hold: float) -> None:
+    durations = _Durations(rate, hold, unit=10)
     shown = _indexed(pictures, palette, durations)
-    next(shown).save(
-        path, format="GIF", save_all=True, append_images=shown, duration=durations, loop=0, optimize=True,
-        palette=colours.tobytes(), transparency=_COLOURS, disposal=1,
-    )  # fmt: skip
+    # Pillow would leave a file open that it opened itself, when it is interrupted.
+    with open(path, "wb") as file:
+        next(shown).save(
+            file, format="GIF", save_all=True, append_images=shown, duration=durations, loop=0, optimize=True,
+            palette=palette.colours.tobytes(), transparency=_COLOURS, disposal=1,
+        )  # fmt: skip
 
 
-def _write_webp(path: Path, pictures: Pictures, colours: np.ndarray, rate: int, hold: float) -> None:
-    palette, durations = _as_image(colours), _Durations(rate, hold, unit=1)
+def _write_webp(path: Path, pictures: Pictures, palette: _Palette, rate: int, hold: float) -> None:
+    durations = _Durations(rate, hold, unit=1)
     shown = _indexed(pictures, palette, durations)
-    # Without key frames, which nobody needs in what is played from the beginning.
-    next(shown).save(
-        path, format="WEBP", save_all=True, append_images=shown, duration=durations, loop=0, lossless=True,
-        quality=60, method=2, kmin=0, kmax=0,
-    )  # fmt: skip
+    with open(path, "wb") as file:
+        # Without key frames, which nobody needs in what is played from the beginning.
+        next(shown).save(
+            file, format="WEBP", save_all=True, append_images=shown, duration=durations, loop=0,
+            lossless=True, quality=60, method=2, kmin=0, kmax=0,
+        )  # fmt: skip
 
 
 class _Durations(list[int]):
@@ -174,36 +178,57 @@ class _Durations(list[int]):
         self.append(self._unit * (round(end + (self._hold if last else 0.0)) - round(begin)))
 
 
-def _indexed(pictures: Pictures, palette: Any, durations: _Durations) -> Iterator[Any]:
+def _indexed(pictures: Pictures, palette: _Palette, durations: _Durations) -> Iterator[Any]:
     """The pictures with palette, each after its duration has been noted."""
-    image, stream = _load_pillow(".gif"), iter(pictures)
+    stream = iter(pictures)
     now = next(stream, None)
     while now is not None:
         following = next(stream, None)
         durations.next(last=following is None)
-        yield image.fromarray(np.ascontiguousarray(now)).quantize(palette=palette, dither=image.Dither.NONE)
+        yield palette.image(now)
         now = following
 
 
-def _palette(samples: Pictures) -> UInt8[np.ndarray, "256 3"]:
-    """255 colours for these pictures, and one more that none of them has.
+@final
+class _Palette:
+    """255 colours for pictures like the samples, and one more that no picture gets.
 
     The most frequent colours, which are those of areas, exactly; of the others, which are those of soft
-    edges, groups of equally many, however rare they are.
+    edges, groups of equally many, however rare they are. Pillow's own assignment would turn white into
+    nearly white; this one takes the nearest colour, and remembers it.
     """
-    image = _load_pillow(".gif")
-    packed = np.concatenate([_packed(picture) for picture in samples])
-    colours, counts = np.unique(packed, return_counts=True)
-    colours = colours[np.argsort(-counts, kind="stable")]
-    exact = _EXACT if len(colours) > _COLOURS else _COLOURS
-    kept, others = colours[:exact], colours[exact:]
-    if len(others):
-        groups = image.fromarray(_unpacked(others)[None]).quantize(_COLOURS - len(kept))
-        grouped = np.asarray(groups.getpalette(), np.uint8).reshape(-1, 3)
-        kept = np.unique(np.concatenate([kept, _packed(grouped)]))
-    taken = set(kept.tolist())
-    spare = islice((colour for colour in range(1 << 24) if colour not in taken), _COLOURS + 1 - len(kept))
-    return _unpacked(np.concatenate([kept, np.fromiter(spare, kept.dtype)]))
+
+    def __init__(self, samples: Pictures):
+        self._pillow = _load_pillow(".gif")
+        packed = np.concatenate([_packed(picture) for picture in samples])
+        found, counts = np.unique(packed, return_counts=True)
+        found = found[np.argsort(-counts, kind="stable")]
+        exact = _EXACT if len(found) > _COLOURS else _COLOURS
+        kept, others = found[:exact], found[exact:]
+        if len(others):
+            groups = self._pillow.fromarray(_unpacked(others)[None]).quantize(_COLOURS - len(kept))
+            grouped = np.asarray(groups.getpalette(), np.uint8).reshape(-1, 3)
+            kept = np.unique(np.concatenate([kept, _packed(grouped)]))
+        taken = set(kept.tolist())
+        spare = islice((colour for colour in range(1 << 24) if colour not in taken), _COLOURS + 1 - len(kept))
+        self.colours = _unpacked(np.concatenate([kept, np.fromiter(spare, kept.dtype)]))
+        self._nearest = np.full(1 << 24, _COLOURS, np.uint8)
+
+    def image(self, picture: UInt8[np.ndarray, "height width 3"]) -> Any:
+        """The picture as one of Pillow's, with this palette."""
+        packed = _packed(picture)
+        index = self._nearest[packed]
+        new = np.unique(packed[index == _COLOURS])
+        if len(new):
+            palette = self.colours[:_COLOURS].astype(np.float32)
+            colours = _unpacked(new).astype(np.float32)
+            # |a - b|^2 without the part that is the same for all b.
+            apart = np.sum(palette**2, axis=-1) - 2.0 * colours @ palette.T
+            self._nearest[new] = np.argmin(apart, axis=-1)
+            index = self._nearest[packed]
+        image = self._pillow.fromarray(index.reshape(picture.shape[:2]))
+        image.putpalette(self.colours.tobytes())
+        return image
 
 
 def _packed(colours: np.ndarray) -> np.ndarray:
@@ -213,10 +238,3 @@ def _packed(colours: np.ndarray) -> np.ndarray:
 
 def _unpacked(colours: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
     return np.stack([colours >> 16, colours >> 8 & 255, colours & 255], axis=-1).astype(np.uint8)
-
-
-def _as_image(colours: np.ndarray) -> Any:
-    # Without the last entry, so that no picture takes it.
-    palette = _load_pillow(".gif").new("P", (1, 1))
-    palette.putpalette(colours[:_COLOURS].tobytes())
-    return palette
