@@ -235,15 +235,18 @@ def test_without_a_package_the_error_names_the_command_that_installs_it(
         animate(PAPER, chase(steps=1), tmp_path / f"x{suffix}")
 
 
-def test_many_colours_keep_those_of_areas_and_need_one_palette(tmp_path):
+def test_one_palette_keeps_the_colours_of_areas_and_rare_ones(tmp_path):
     hues = np.linspace(0, 255, 160).astype(np.uint8)
     picture = np.stack(np.broadcast_arrays(hues[None, :], hues[:90, None], np.uint8(120)), axis=-1)
     picture[40:50] = BLUE
+    picture[70, 80:85] = (0, 255, 0)
     moved = np.roll(picture, 1, axis=1)
     path = write_video_file(tmp_path / "x.gif", [picture, moved], 10, samples=[picture])
     (first, second), _, _ = decoded(path)
     assert np.array_equal(first[40:50], picture[40:50])
     assert np.array_equal(second[40:50], picture[40:50])
+    # Rare, but like nothing else.
+    assert np.abs(first[70, 80:85].astype(int) - (0, 255, 0)).max() < 30
     assert np.abs(second.astype(int) - moved).mean() < 8.0
 
 

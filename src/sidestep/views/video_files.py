@@ -21,10 +21,10 @@ SUFFIXES = (".mp4", ".gif", ".webp")
 _INSTALL = "pip install 'sidestep[video]'"
 _H264 = {"crf": "21", "preset": "veryfast", "tune": "animation"}
 """Quality 21: 18 is hardly to be told from the original, 28 looks worn. Slower presets gain nothing here."""
-_COLOURS = 255
-"""Of the 256 entries of a palette, the last one stands for what has not changed."""
-_EXACT = 128
-"""Colours that get an entry of their own, the most frequent ones; the others are put into groups."""
+_COLOURS = 127
+"""Of the 128 entries of a palette, the last one stands for what has not changed."""
+_EXACT = 32
+"""How many colours get an entry because they are frequent."""
 
 
 class VideoError(ValueError):
@@ -191,11 +191,11 @@ def _indexed(pictures: Pictures, palette: _Palette, durations: _Durations) -> It
 
 @final
 class _Palette:
-    """255 colours for pictures like the samples, and one more that no picture gets.
+    """127 colours for pictures like the samples, and one more that no picture gets.
 
-    The most frequent colours, which are those of areas, exactly; of the others, which are those of soft
-    edges, groups of equally many, however rare they are. Pillow's own assignment would turn white into
-    nearly white; this one takes the nearest colour, and remembers it.
+    The most frequent colours, which are those of areas, exactly; of the others, some from wherever there
+    are any, however rare, since a target is small. Pillow's own assignment would turn white into nearly
+    white; this one takes the nearest colour, and remembers it.
     """
 
     def __init__(self, samples: Pictures):
@@ -206,7 +206,8 @@ class _Palette:
         exact = _EXACT if len(found) > _COLOURS else _COLOURS
         kept, others = found[:exact], found[exact:]
         if len(others):
-            groups = self._pillow.fromarray(_unpacked(others)[None]).quantize(_COLOURS - len(kept))
+            rest = self._pillow.fromarray(_unpacked(others)[None])
+            groups = rest.quantize(_COLOURS - len(kept), self._pillow.Quantize.MAXCOVERAGE)
             grouped = np.asarray(groups.getpalette(), np.uint8).reshape(-1, 3)
             kept = np.unique(np.concatenate([kept, _packed(grouped)]))
         taken = set(kept.tolist())
