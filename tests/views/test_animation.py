@@ -145,6 +145,15 @@ def test_any_episode_can_be_animated(parts, chase, tmp_path):
     assert 0.02 < np.mean(pictures[-1].mean(axis=-1) < 200) < 0.5
 
 
+def test_every_target_of_a_recording_from_the_live_page_is_in_view(chase):
+    record = chase(steps=2)
+    moved = record.worlds.target.at[2].set(jnp.array([-3.0, 2.0]))
+    record = eqx.tree_at(lambda record: record.worlds.target, record, moved)
+    world = Stage(PAPER, record, width=160).world
+    assert world.get_xlim()[0] < -3.05
+    assert world.get_ylim()[1] > 2.05
+
+
 def test_the_way_of_a_turning_pursuer_is_its_arc(chase):
     still = chase(steps=2)
     speed, turn, start = 0.15, 0.9, 3.12  # m/s, rad/s; through the jump of headings at pi

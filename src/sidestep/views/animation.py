@@ -49,8 +49,10 @@ from sidestep.world import Scenario
 _INCHES = (8.0, 4.5)
 _WORLD, _SEEN = (0.42, 1.92, 4.88, 2.06), (5.74, 1.92, 2.06, 2.06)
 _BARRIERS, _CORRECTIONS = (0.42, 0.82, 7.38, 0.42), (0.42, 0.36, 7.38, 0.27)
-"""Places of the axes: left, bottom, width, height in inches. Fixed, so that nothing ever jitters."""
-_TICKS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0)
+_TOP = 4.26
+"""Places of the axes (left, bottom, width, height) and height of the first line, in inches. They never
+change, so nothing jitters."""
+_TICKS = (0.0, 0.02, 0.1, 0.5, 1.0, 2.0, 4.0)
 _RECENT_SECONDS = 5.0
 _FINEST = 0.025
 _WIDEST = 3.2
@@ -163,44 +165,31 @@ class Stage:
         if trajectory.length < 1:
             raise VideoError("the episode has no control period to show")
         self.motion = Motion(scenario, trajectory)
-        self._scenario, self._trajectory = scenario, trajectory
+        self._trajectory, self._status = trajectory, np.asarray(trajectory.status)
         self._ways = _Ways(scenario, trajectory, self.motion)
+        self._speed = "" if speed == 1.0 else f" (× {speed:g})"
+        words = title if title is not None else shield_words(shield) if shield else ""
+        self._words = words[:1].upper() + words[1:]
         start = self.motion.at(0.0)
         with house_style():
-            size = (2 * round(width / 2), 2 * round(width * _INCHES[1] / _INCHES[0] / 2))
-            self._figure = Figure(figsize=(size[0] / 160, size[1] / 160), dpi=160)
-            self._figure.set_dpi(width / _INCHES[0])
-            self._figure.set_size_inches(size[0] / self._figure.dpi, size[1] / self._figure.dpi)
+            # An MP4 needs even numbers of pixels.
+            pixels = 2 * np.ceil(np.array(_INCHES) * width / _INCHES[0] / 2.0)
+            dpi = width / _INCHES[0]
+            self._figure = Figure(figsize=tuple(pixels / dpi), dpi=dpi)
             self._canvas = FigureCanvasAgg(self._figure)
             self.world, self.seen = self._axes(_WORLD), self._axes(_SEEN)
-            strips = self._axes(_BARRIERS), self._axes(_CORRECTIONS)
             _set_up_world(self.world, scenario, trajectory)
-            self._titles = [
-                self._text(_WORLD[0], 4.03, "The world, m", weight="bold", size=8.0),
-                self._text(_SEEN[0], 4.03, "", weight="bold", size=8.0),
-            ]
-            for place, words in (
-                (_BARRIERS, "Barriers h: how far from capture and collision, m (√ scale)"),
-                (_CORRECTIONS, "How far the shield changed the velocity, m/s"),
-            ):
-                self._text(place[0], place[1] + place[3] + 0.035, words, size=6.5)
             _set_up_seen(self.seen, scenario, self._ways.distances)
-            pursuit, pursuers = shield in PURSUIT_SHIELDS, len(start.poses)
-            others = pursuers + len(start.obstacles)
+            look = {"pursuit": shield in PURSUIT_SHIELDS, "levels": levels}
+            others = len(start.poses) + len(start.obstacles)
             self._panels = (
-                MovingPanel(self.world, scenario, start, trails=others, pursuit=pursuit, levels=levels),
-                MovingPanel(self.seen, scenario, start, trails=0, pursuit=pursuit, levels=levels),
+                MovingPanel(self.world, scenario, start, trails=others, **look),
+                MovingPanel(self.seen, scenario, start, trails=0, **look),
             )
+            strips = self._axes(_BARRIERS), self._axes(_CORRECTIONS)
             self._veils = _draw_strips(*strips, scenario, trajectory)
             self._draw_key(len(start.obstacles) > 0, levels)
-            words = title if title is not None else shield_words(shield) if shield else ""
-            self._words = words[:1].upper() + words[1:]
-            self._heading = self._text(_WORLD[0], 4.26, self._words, weight="bold", size=11.0)
-            right = _SEEN[0] + _SEEN[2]
-            self._clock = self._text(right, 4.26, "", size=9.0, ha="right")
-            self._answer = self._text(right - 1.35, 4.26, "", size=8.0, ha="right")
-            self._speed = "" if speed == 1.0 else f" (× {speed:g})"
-            self._labels = (*self._titles[1:], self._heading, self._answer)
+            self._write_words()
             self._moving: list[tuple[Axes, Artist]] = [
                 (panel.axes, artist) for panel in self._panels for artist in panel.artists
             ]
@@ -210,6 +199,21 @@ class Stage:
             self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(self._figure.bbox)
         self._labelled: tuple[list[str], Any] = ([], None)
+
+    def _write_words(self) -> None:
+        """Titles that stay, and empty texts for what is said later."""
+        self._text(_WORLD[0], _WORLD[1] + _WORLD[3] + 0.05, "The world, m", weight="bold", size=8.0)
+        for place, words in (
+            (_BARRIERS, "Barriers h: how far from capture and collision, m (√ scale)"),
+            (_CORRECTIONS, "How far the shield changed the velocity, m/s"),
+        ):
+            self._text(place[0], place[1] + place[3] + 0.035, words, size=6.5)
+        right = _SEEN[0] + _SEEN[2]
+        self._frame = self._text(_SEEN[0], _SEEN[1] + _SEEN[3] + 0.05, "", weight="bold", size=8.0)
+        self._heading = self._text(_WORLD[0], _TOP, "", weight="bold", size=11.0)
+        self._answer = self._text(right - 1.35, _TOP, "", size=8.0, ha="right")
+        self._clock = self._text(right, _TOP, "", size=9.0, ha="right")
+        self._labels = (self._frame, self._heading, self._answer)
 
     def _axes(self, place: tuple[float, float, float, float]) -> Axes:
         across, up = _INCHES
@@ -271,31 +275,37 @@ class Stage:
         from_it = now.seen_from(pose)
         seen.show(from_it, outcome)
         seen.show_trails(*self._ways.seen_by(pursuer, from_it))
+        self._say(now, pursuer, end)
         for _, (veil, line) in self._veils:
             cast(Rectangle, veil).set_x(time)
             cast(Rectangle, veil).set_width(max(self.motion.duration - time, 0.0))
             cast(Line2D, line).set_xdata([time, time])
+
+    def _say(self, now: Instant, pursuer: int, end: bool) -> None:
         several = len(now.poses) > 1
         frame = f"the frame of pursuer {pursuer + 1}" if several else "the pursuer's frame"
-        self._titles[1].set_text(f"In {frame}, m")
-        self._clock.set_text(f"{time:.2f} s{self._speed}")
-        colour, words = ANSWERS[int(np.asarray(self._trajectory.status)[now.period])]
+        self._frame.set_text(f"In {frame}, m")
+        self._clock.set_text(f"{now.time:.2f} s{self._speed}")
+        colour, words = ANSWERS[int(self._status[now.period])]
         self._answer.set_text(f"shield: {words}")
         self._answer.set_color(INK if words == "unchanged" else colour)
+        told, colour = self._words, INK
         if end:
-            told = f"{OUTCOME_WORDS[self._trajectory.outcome]} after {self.motion.duration:.2f} s"
+            outcome = self._trajectory.outcome
+            colour = OUTCOME_COLOURS.get(outcome, INK)
+            told = f"{OUTCOME_WORDS[outcome]} after {self.motion.duration:.2f} s"
             told = f"{self._words}: {told}" if self._words else told[:1].upper() + told[1:]
-            self._heading.set_text(told)
-            self._heading.set_color(OUTCOME_COLOURS.get(self._trajectory.outcome, INK))
-        else:
-            self._heading.set_text(self._words)
-            self._heading.set_color(INK)
+        self._heading.set_text(told)
+        self._heading.set_color(colour)
 
 
 def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
     """Limits that hold everything that ever moves, at equal scales, filling the panel."""
     low, high = scene_extent(trajectory)
-    low, high = low - scene_margin(scenario), high + scene_margin(scenario)
+    # On the live page there is another target after each that is reached.
+    targets = np.asarray(trajectory.worlds.target)
+    low = np.minimum(low, targets.min(axis=0)) - scene_margin(scenario)
+    high = np.maximum(high, targets.max(axis=0)) + scene_margin(scenario)
     shape = np.array(_WORLD[2:])
     half = np.max((high - low) / shape) * shape / 2.0
     middle = (low + high) / 2.0
@@ -345,8 +355,11 @@ def _draw_strips(
         (line,) = strip.plot([0, 0], [0, 1], transform=strip.get_xaxis_transform(), color=INK, linewidth=1.0)
         veils.append((strip, (veil, line)))
     barriers.tick_params(labelbottom=False)
-    # Fewer than in a figure: the strip is low.
-    ticks = [tick for tick in _TICKS if tick <= barriers.get_ylim()[1]]
+    # Fewer than in a figure: the strip is low. On the scale of square roots they must lie apart.
+    ticks, room = [_TICKS[0]], 0.18 * np.sqrt(barriers.get_ylim()[1])
+    for tick in _TICKS[1:]:
+        if tick <= barriers.get_ylim()[1] and np.sqrt(tick) >= np.sqrt(ticks[-1]) + room:
+            ticks.append(tick)
     barriers.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     barriers.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=6.5, borderpad=0.1, borderaxespad=0.2

@@ -66,12 +66,13 @@ class _Pursuer:
         axle = float(scenario.pursuer_half_axle)
         self._outline = capture_set_outline(scenario, 61)
         self._circle = float(scenario.capture_distance) * _CIRCLE
-        # A wheel as thick as it is in proportion to the axle, but never too thin to be seen.
-        length = float(np.clip(0.5 * axle, 0.05, 0.12))
+        # The axle is true; wheels and body are as large as fits it and the capture circle.
+        room = min(axle, float(scenario.capture_distance))
+        length = 0.5 * room
         wheel = 0.5 * length * np.array([[-1.0, -0.32], [1.0, -0.32], [1.0, 0.32], [-1.0, 0.32]])
         self._wheels = [wheel + np.array([0.0, side * axle]) for side in (-1.0, 1.0)]
         self._axle = np.array([[0.0, -axle], [0.0, axle]])
-        self._body = float(np.clip(0.7 * axle, 0.09, 0.14)) * _BODY
+        self._body = 0.7 * room * _BODY
         self._parts: list[tuple[Any, np.ndarray]] = []
 
         def area(shape: np.ndarray, zorder: float, **look: Any) -> None:
