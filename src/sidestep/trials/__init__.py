@@ -5,7 +5,14 @@ from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.keys import episode_key
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import as_policy
-from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
+from sidestep.trials.rollout import (
+    Episode,
+    Trajectory,
+    load_episode,
+    load_trajectory,
+    rollout,
+    save_trajectory,
+)
 from sidestep.trials.statistics import (
     interquartile_mean,
     stratified_bootstrap,
@@ -15,6 +22,7 @@ from sidestep.trials.statistics import (
 
 __all__ = [
     "Capture",
+    "Episode",
     "Evaluation",
     "Trajectory",
     "as_policy",
@@ -24,6 +32,7 @@ __all__ = [
     "examine_captures",
     "explain_capture",
     "interquartile_mean",
+    "load_episode",
     "load_trajectory",
     "rollout",
     "save_trajectory",
