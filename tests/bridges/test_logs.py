@@ -254,13 +254,18 @@ def test_evaluate_logs_the_episode_that_was_asked_for(tmp_path, capsys, monkeypa
     from sidestep.trials import episode_key, rollout
 
     # What is measured is tested elsewhere, and would take longest here.
-    monkeypatch.setattr(sidestep.trials, "evaluate", lambda *_, **__: SimpleNamespace(to_dict=dict))
+    closest = {"min_pursuer_clearance": np.array([0.2, 0.3, 0.4]), "min_obstacle_clearance": [9.0, 0.1, 9.0]}
+    measured = SimpleNamespace(to_dict=dict, **closest)
+    monkeypatch.setattr(sidestep.trials, "evaluate", lambda *_, **__: measured)
     monkeypatch.setattr(evaluate, "evaluation_table", lambda _: "")
     path = tmp_path / "one.mcap"
     command = ["evaluate", "goal-seeking", "--shield", "none", "--pursuer", "still"]
     command += ["--episodes", "3", "--batch", "3", "--set"]
     command += ["episode_steps=40", "--log", str(path), "--log-episode", "2"]
-    assert main(command) == 0
+    video = ["--video", str(tmp_path / "one.gif"), "--video-episode", "worst", "--video-width", "160"]
+    assert main([*command, *video, "--video-rate", "1", "--video-levels"]) == 0
+    assert "Video of episode 1 (timed out)" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "one.gif").read_bytes().startswith(b"GIF89a")
     scenario = load_scenario("paper", episode_steps=40)
     expected = rollout(scenario, "goal-seeking", "none", "still", episode_key(0, 2))
     read = load_log(path).trajectory

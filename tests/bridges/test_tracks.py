@@ -58,7 +58,7 @@ def test_the_drift_of_an_obstacle_is_found_within_seconds_and_predicts_where_it_
 
 
 def test_the_own_motion_since_a_late_pose_is_added_from_the_commands_when_they_act():
-    track = EvaderTrack(NOISE, TURN, 0.003, lag=0.02)
+    track = EvaderTrack(NOISE, TURN, 0.003, delay=0.02)
     track.start(0.0, np.zeros(3))
     track.told(0.0, np.array([0.1, 0.0]))
     track.told(0.05, np.array([0.0, 0.1]))
@@ -69,8 +69,27 @@ def test_the_own_motion_since_a_late_pose_is_added_from_the_commands_when_they_a
     np.testing.assert_allclose(track.at(0.1)[:2], [0.005, 0.003], atol=1e-9)
 
 
+def test_motors_that_lag_and_have_a_limit_are_followed_exactly():
+    lag, limit, told = 0.02, 2.0, np.array([-0.1, 0.1])
+    track = EvaderTrack(NOISE, TURN, 0.003, delay=0.0, motor_lag=lag, acceleration=limit)
+    track.start(0.0, np.zeros(3))
+    track.told(0.0, np.array([0.15, 0.0]))
+    track.told(0.2, told)
+    place, velocity, step = np.zeros(2), np.zeros(2), 1e-5
+    for i in range(30000):
+        wanted = np.array([0.15, 0.0]) if i * step < 0.2 else told
+        change = (wanted - velocity) / lag
+        change *= min(1.0, limit / max(np.linalg.norm(change), 1e-9))
+        place, velocity = place + step * velocity, velocity + step * change
+    np.testing.assert_allclose(track.at(0.3)[:2], place, atol=2e-6)
+    # The same in parts: what is known at one pose is the beginning of the next.
+    track.take(0.22, track.at(0.22))
+    track.take(0.25, track.at(0.25))
+    np.testing.assert_allclose(track.at(0.3)[:2], place, atol=2e-6)
+
+
 def test_averaging_poses_of_a_moving_robot_does_not_hold_it_back():
-    rng, track = np.random.default_rng(2), EvaderTrack(NOISE, TURN, 0.003, lag=0.0)
+    rng, track = np.random.default_rng(2), EvaderTrack(NOISE, TURN, 0.003, delay=0.0)
     off, truth = [], np.zeros(2)
     for i in range(400):
         if i % 5 == 0:

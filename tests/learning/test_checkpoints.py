@@ -180,6 +180,7 @@ train(
 """
 
 
+@pytest.mark.slow
 def test_kill_of_the_process_at_random_moments_changes_no_bit_of_the_run(small, tmp_path):
     """Chunks take milliseconds here, so that most kills fall into a write."""
     episodes, folder = 60, tmp_path / "killed"

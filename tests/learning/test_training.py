@@ -153,6 +153,7 @@ def half_turned(world, vector):
     return 0.5 * jnp.stack([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
 
 
+@pytest.mark.slow
 def test_executed_actions_are_learned_from_through_the_shield_of_their_own_world(small, small_run):
     """The target action through that of the world after; the actor's, if asked for, of the one before."""
     scenario, replay, key = small.scenario(), small_run.state.replay, jax.random.key(11)

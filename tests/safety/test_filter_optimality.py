@@ -95,7 +95,7 @@ def test_the_correction_is_a_combination_of_active_rows(x64, problems):
     assert checked >= 500
 
 
-@pytest.mark.parametrize("circle", [False, True])
+@pytest.mark.parametrize("circle", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_gradients_are_true_where_they_exist(x64, problems, circle):
     """Against central differences; at the seams between cases, where there is none, differences disagree."""
     batch = problems(1500, 3, seed=17, families=("random", "scaled", "far nominal", "crowded"))
@@ -132,7 +132,7 @@ def test_gradients_are_true_where_they_exist(x64, problems, circle):
     assert not np.any(wrong & smooth), np.flatnonzero(wrong & smooth)[:5]
 
 
-@pytest.mark.parametrize("circle", [False, True])
+@pytest.mark.parametrize("circle", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_gradients_stay_finite_on_every_awkward_row(precision, problems, circle):
     batch = problems(3000, 3, seed=18).cast(jnp.zeros(()).dtype)
     batch.nominal[::7] = 0.0

@@ -103,6 +103,7 @@ def test_known_wheel_speeds_that_are_not_finite_fall_back_on_the_worst_case():
     assert np.all(rows.normals @ result.action >= rows.offsets - 1e-6)
 
 
+@pytest.mark.slow
 def test_a_known_pursuer_that_is_nowhere_is_invalid_and_the_rest_is_kept():
     scenario = load_scenario("paper", pursuer_count=2, obstacle_count=1)
     world = scenario.reset(jax.random.key(1))

@@ -217,7 +217,9 @@ def test_senseless_budget_is_refused(scenario, tmp_path, budget, words):
 def test_replay_from_the_command_line_shows_what_happened(found, tmp_path, capsys):
     path = found.counterexamples[0]
     out, figures = tmp_path / "shown", tmp_path / "figures.json"
-    assert main(["falsify", "--replay", str(path), "--out", str(out), "--json", str(figures)]) == 0
+    video = ["--video", str(tmp_path / "x.webp"), "--video-rate", "1", "--video-width", "160"]
+    assert main(["falsify", "--replay", str(path), "--out", str(out), "--json", str(figures), *video]) == 0
+    assert (tmp_path / "x.webp").read_bytes()[8:12] == b"WEBP"
     told = capsys.readouterr().out
     assert "to the last bit" in told
     assert "Assumption broken" in told

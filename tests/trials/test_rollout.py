@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.trials import load_trajectory, rollout, save_trajectory
-from sidestep.world import load_scenario
+from sidestep.trials import load_episode, load_trajectory, rollout, save_trajectory
+from sidestep.world import load_scenario, scenario_to_dict
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +69,22 @@ def test_saved_trajectory_comes_back_whole(trajectory, tmp_path):
         np.array_equal(a, b) for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(trajectory), strict=True)
     )
     assert back.outcome == trajectory.outcome
+
+
+def test_a_recording_says_in_which_scenario_it_was_made(scenario, trajectory, tmp_path):
+    about = {"shield": "paper", "seed": 3}
+    save_trajectory(tmp_path / "told.npz", trajectory, scenario, about)
+    back = load_episode(tmp_path / "told.npz")
+    assert scenario_to_dict(back.scenario) == scenario_to_dict(scenario)
+    assert back.about == about
+    assert np.array_equal(back.trajectory.worlds.evader, trajectory.worlds.evader)
+    save_trajectory(tmp_path / "untold.npz", trajectory)
+    assert load_episode(tmp_path / "untold.npz").scenario is None
+    with np.load(tmp_path / "told.npz") as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / "bad.npz", **{**arrays, "told": np.frombuffer(b"{", np.uint8)})
+    with pytest.raises(ValueError, match="no recorded trajectory"):
+        load_episode(tmp_path / "bad.npz")
 
 
 def test_damaged_file_is_refused(tmp_path):

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from sidestep.cli import main
-from sidestep.trials.rollout import load_trajectory
+from sidestep.trials import load_episode
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import PlayError, listen, make_server
 from sidestep.views.play.visitor import Allowance, Outbox
@@ -201,7 +201,11 @@ def test_an_episode_is_downloaded_as_everything_else_reads_it(server, tmp_path):
         _, headers, content = server.get(f"/episode/{socket.hello['token']}.npz")
         assert "attachment" in headers["content-disposition"]
     (tmp_path / "episode.npz").write_bytes(content)
-    trajectory = load_trajectory(tmp_path / "episode.npz")
+    episode = load_episode(tmp_path / "episode.npz")
+    # With what an animation needs, too.
+    assert float(episode.scenario.capture_distance) == pytest.approx(0.2)
+    assert episode.about["source"] == "sidestep play"
+    trajectory = episode.trajectory
     assert trajectory.length >= 9
     moved = np.diff(np.asarray(trajectory.worlds.evader), axis=0)
     np.testing.assert_allclose(moved, 0.05 * np.asarray(trajectory.action), atol=1e-5)

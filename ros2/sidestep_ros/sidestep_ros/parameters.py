@@ -195,6 +195,8 @@ DECIDING = (
     Parameter("position_noise", 0.001, "Standard deviation of measured positions, m.", 0.0),
     Parameter("heading_noise", 0.005, "Standard deviation of measured headings, rad.", 0.0),
     Parameter("actuation_delay", 0.0, "Time from a command to its effect, s; a part of budget.delay.", 0.0),
+    Parameter("motor_lag", 0.0, "Time constant with which the motors reach the velocity told, s.", 0.0),
+    Parameter("motor_acceleration", 1000.0, "The most that the motors accelerate the robot, m/s^2.", 0.001),
     Parameter("predict_pursuer", False, "Also drive the pursuers on from their last poses."),
     Parameter("obstacle_acceleration", 0.02, "How fast an obstacle's drift may change, m/s^2.", 0.0),
     Parameter("jump_tolerance", 0.05, "A pose is a jump beyond what the robot can drive and this, m.", 0.0),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from sidestep.commands.common import CountBar, Overrides, parse_overrides, write_json_file
+from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,12 +43,17 @@ class Evaluate:
     """Also write one episode as an MCAP log of ROS 2 messages; never over a file that exists."""
     log_episode: int = 0
     """Which episode --log is to hold: the number of one of those measured."""
+    video_episode: Annotated[str, tyro.conf.arg(metavar="NUMBER|worst")] = "0"
+    """Which episode --video is to show: the number of one of those measured, or the one that came closest
+    to capture or collision."""
+    film: VideoOptions = NO_VIDEO
 
 
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
     from sidestep.learning import load_policy
     from sidestep.learning.records import open_run
+    from sidestep.trials import episode_key, rollout
     from sidestep.trials import evaluate as run_evaluation
     from sidestep.world import load_scenario
 
@@ -68,6 +74,12 @@ def run(command: Evaluate, console: Console) -> int:
         )
     if command.log is not None and command.log.exists():
         raise ValueError(f"{command.log} exists already; give the log another name")
+    if command.video_episode != "worst" and not _is_number(command.video_episode, command.episodes):
+        raise ValueError(
+            f"video_episode = {command.video_episode}: it must be worst or the number of an episode, 0 to "
+            f"{command.episodes - 1}"
+        )
+    check_options(command.film)
     shield = command.shield or config.get("shield", "joint")
     pursuer = command.pursuer or config.get("pursuer", "nash")
     with CountBar(console, f"{shield} shield, {pursuer}") as show:
@@ -81,7 +93,24 @@ def run(command: Evaluate, console: Console) -> int:
     if command.log is not None:
         told = {**about, "seed": command.seed, "episode": command.log_episode, "source": "simulation"}
         _write_log(command, scenario, policy, told, console)
+    if command.film.video is not None:
+        number = _chosen(command.video_episode, evaluation)
+        trajectory = rollout(scenario, policy, shield, pursuer, episode_key(command.seed, number))
+        write_video(command.film, scenario, trajectory, shield, console, f"episode {number}")
     return 0
+
+
+def _is_number(text: str, episodes: int) -> bool:
+    return text.isascii() and text.isdigit() and int(text) < episodes
+
+
+def _chosen(episode: str, evaluation: Evaluation) -> int:
+    """The number of an episode; of the least clearance to anybody for `worst`."""
+    if episode != "worst":
+        return int(episode)
+    import numpy as np
+
+    return int(np.argmin(np.minimum(evaluation.min_pursuer_clearance, evaluation.min_obstacle_clearance)))
 
 
 def _write_log(

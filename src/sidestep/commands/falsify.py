@@ -15,6 +15,7 @@ from sidestep.commands.common import (
     parse_overrides,
     write_json_file,
 )
+from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,10 +59,14 @@ class Falsify:
     """Play this counterexample again, check that it ends the same, and draw it. Searches for nothing."""
     json: Path | None = None
     """Also write the figures to this file."""
+    film: VideoOptions = NO_VIDEO
 
 
 def run(command: Falsify, console: Console) -> int:
     """Run `sidestep falsify`; returns the exit status."""
+    check_options(command.film)
+    if command.film.video is not None and command.replay is None:
+        raise ValueError("--video shows one counterexample: give it with --replay")
     if command.replay is not None:
         return _replay(command, console)
     from sidestep.learning.records import open_run
@@ -265,6 +270,7 @@ def _replay(command: Falsify, console: Console) -> int:
     folder = command.out or command.replay.parent
     folder.mkdir(parents=True, exist_ok=True)
     console.print(f"Figure: {draw(counterexample, played, folder / command.replay.stem)}", highlight=False)
+    write_video(command.film, played.scenario, trajectory, about["shield"], console)
     facts = {**about, "same": played.same, "exact": played.exact}
     write_json_file(command.json, facts)
     return 0 if played.same else 1

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from sidestep.commands.common import CountBar
+from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,16 +18,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Report:
-    """Write the figures and the self-contained HTML report of one or several runs, or of one log."""
+    """Write the figures and the self-contained HTML report of one or several runs, or of one episode."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]|LOG")]
-    """Run folders, or the folder of a reproduction; or an MCAP log of one episode."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]|EPISODE")]
+    """Run folders, or the folder of a reproduction; or one episode: an MCAP log, or the .npz recording of the
+    live page, of the twin or in a run folder."""
     out: Path | None = None
-    """HTML file to write; report.html in the first folder, or beside the log, by default. Its figures go into
-    figures/ beside it, or NAME-figures/ for NAME.html."""
+    """HTML file to write; report.html in the first folder, or beside the episode, by default. Its figures go
+    into figures/ beside it, or NAME-figures/ for NAME.html."""
     episodes: int = 100
     """Random episodes to run with a policy whose folder holds no record of any: for the histograms, the map
     of interventions and the worst episodes. They are kept in the folder. 0 for none."""
+    film: VideoOptions = NO_VIDEO
 
 
 def run(command: Report, console: Console) -> int:
@@ -33,9 +37,12 @@ def run(command: Report, console: Console) -> int:
     from sidestep.views import write_report
 
     if not command.runs:
-        raise ValueError("a report needs at least one run folder, or a log")
-    if any(path.suffix == ".mcap" for path in command.runs):
-        return _report_log(command, console)
+        raise ValueError("a report needs at least one run folder, or an episode")
+    check_options(command.film)
+    if any(path.suffix in (".mcap", ".npz") for path in command.runs):
+        return _report_episode(command, console)
+    if command.film.video is not None:
+        raise ValueError("--video shows one episode: give its log or recording instead of a run")
     if command.episodes < 0:
         raise ValueError(f"episodes = {command.episodes}: it must be 0 or more")
     folders = _run_folders(command.runs, console)
@@ -101,20 +108,45 @@ def _look_closer(folder: Path, episodes: int, console: Console) -> None:
     save_survey(folder, survey)
 
 
-def _report_log(command: Report, console: Console) -> int:
-    from sidestep.bridges.logs import load_log
+def _report_episode(command: Report, console: Console) -> int:
     from sidestep.views import write_episode_report
 
     path, *others = command.runs
     if others:
-        raise ValueError("a report is of runs or of one log")
-    log = load_log(path)
+        raise ValueError("a report is of runs or of one episode")
+    scenario, trajectory, about, notes = _read_episode(path)
     out = command.out or path.with_suffix(".html")
     _refuse_other_files(out)
-    written = write_episode_report(
-        log.scenario, log.trajectory, out, title=f"Log {path.stem}", about=log.about, notes=log.rebuilt
-    )
-    for note in log.rebuilt:
+    title = f"{'Log' if path.suffix == '.mcap' else 'Recording'} {path.stem}"
+    written = write_episode_report(scenario, trajectory, out, title=title, about=about, notes=notes)
+    for note in notes:
         console.print(f"Not in the log: {note}.", highlight=False)
     console.print(f"Report with figure: {written}", highlight=False)
+    write_video(command.film, scenario, trajectory, str(about.get("shield", "")), console)
     return 0
+
+
+def _read_episode(path: Path) -> tuple[Any, Any, Mapping[str, Any], Sequence[str]]:
+    """Scenario, trajectory, what is said of them, and what had to be worked out."""
+    if path.suffix == ".mcap":
+        from sidestep.bridges.logs import load_log
+
+        log = load_log(path)
+        return log.scenario, log.trajectory, log.about, log.rebuilt
+    from sidestep.learning.records import open_run
+    from sidestep.trials import load_episode
+    from sidestep.world import load_scenario
+
+    if not path.is_file():
+        raise ValueError(f"there is no recording {path}")
+    try:
+        episode = load_episode(path)
+    except ValueError as error:
+        raise ValueError(f"{error} (a counterexample is shown by sidestep falsify --replay)") from error
+    if episode.scenario is not None:
+        return episode.scenario, episode.trajectory, episode.about, ()
+    if not (path.parent / "config.json").is_file():
+        raise ValueError(f"{path} does not say in which scenario it was recorded, and lies in no run folder")
+    config = open_run(path.parent)
+    about = {name: config[name] for name in ("shield", "pursuer", "seed") if name in config}
+    return load_scenario("paper", **config["scenario"]), episode.trajectory, about, ()

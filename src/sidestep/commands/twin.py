@@ -133,7 +133,8 @@ def _draw(
 
     simulation = rollout(scenario, policy, command.shield, command.pursuer, episode.seed, steps=command.steps)
     folder.mkdir(parents=True, exist_ok=True)
-    save_trajectory(folder / "twin.npz", episode.trajectory)
+    about = {"shield": command.shield, "pursuer": command.pursuer, "source": "sidestep twin"}
+    save_trajectory(folder / "twin.npz", episode.trajectory, scenario, about)
     words = f"physics twin, {command.base}, {command.sensors}"
     png, pdf = twin_figure(
         scenario, simulation, episode.trajectory, folder / "twin", shield=command.shield, twin_words=words

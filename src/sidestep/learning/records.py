@@ -7,7 +7,8 @@
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,23 +47,30 @@ def json_safe(value: Any) -> Any:
     return None if isinstance(number, float) and not math.isfinite(number) else number
 
 
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all: a reader, or a restart after a kill, sees the old or the new one.
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """A path beside `path` to write to; what is there at the end takes its place, and nothing if that fails.
 
-    Written beside its place, synced to disk, renamed over it, and the folder synced too.
+    Synced to disk, renamed over `path`, and the folder synced too: a reader, or a restart after a kill, sees
+    the old file or the new one.
     """
     path = Path(path)
     beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(beside, "wb") as file:
-            file.write(content)
-            file.flush()
+        yield beside
+        with open(beside, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(beside, path)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file whole or not at all, see `whole_file`."""
+    with whole_file(path) as beside:
+        beside.write_bytes(content)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -362,6 +362,8 @@ class PursuitBarrier(Barrier):
             decided = jnp.abs(aside) > _DECIDED * scenario.evader_speed
             own = self.recall(scenario, world.evader, robot, None)
             free = (wanted == own) | self._may_keep(scenario, game, z, wanted)
+            if self.budget is not None:
+                free = self._surely_feasible(scenario, game, z, wanted)
             return jnp.where(decided & free, wanted, kept)
 
         return jax.vmap(side)(world.pursuers, real(memory))
@@ -372,21 +374,37 @@ class PursuitBarrier(Barrier):
         cosine, sine = jnp.cos(game.usable_angle), jnp.sin(game.usable_angle)
         ahead, across = jnp.abs(z[0]), jnp.maximum(-side * z[1], 0.0)
         if self.budget is not None:
-            doubt = self.budget.position_error + self.budget.heading_error * length(z[0], z[1])
-            across = jnp.maximum(across - doubt, 0.0)
+            across = jnp.maximum(across - self._doubt(z), 0.0)
         in_front = jnp.abs(z[1]) * cosine < ahead * sine
-
-        def reach(h: Lanes) -> Lanes:
-            """How far across the axis the row of a side with value h stays feasible (m)."""
-            turn = game.half_axle * (game.evader_speed + self.allowance(scenario, h)) / game.pursuer_speed
-            return cosine * turn - sine * (game.capture_distance + h)
-
         h = ahead * cosine - across * sine - game.capture_distance
         own = ahead * cosine + across * sine - game.capture_distance
-        feasible = (h >= 0.0) & (across <= KEEP_SIDE * reach(h))
+        feasible = (h >= 0.0) & (across <= KEEP_SIDE * self._reach(scenario, game, h))
         # With no side left to save it, the evader still does best to commit to one.
-        lost = (own < 0.0) | (reach(own) < 0.0)
+        lost = (own < 0.0) | (self._reach(scenario, game, own) < 0.0)
         return in_front & (feasible | (lost & (across <= LOST_SIDE * game.capture_distance)))
+
+    def _surely_feasible(
+        self, scenario: Scenario, game: CaptureGame, z: Float[Array, "2 *lanes"], side: Lanes
+    ) -> Bool[Array, "*lanes"]:
+        """Whether the row of a side can be kept wherever, within the budget's errors, the evader is."""
+        cosine, sine = jnp.cos(game.usable_angle), jnp.sin(game.usable_angle)
+        ahead, across = jnp.abs(z[0]), self._doubt(z) - side * z[1]
+        in_front = jnp.abs(z[1]) * cosine < ahead * sine
+        h = ahead * cosine - across * sine - game.capture_distance
+        reach = self._reach(scenario, game, h)
+        feasible = (h >= 0.0) & (across <= jnp.minimum(KEEP_SIDE * reach, reach))
+        return jnp.where(in_front, feasible, side * z[1] >= 0.0)
+
+    def _doubt(self, z: Float[Array, "2 *lanes"]) -> Lanes:
+        """How far (m) the evader may be from where it seems to be in a pursuer's frame."""
+        assert self.budget is not None
+        return self.budget.position_error + self.budget.heading_error * length(z[0], z[1])
+
+    def _reach(self, scenario: Scenario, game: CaptureGame, h: Lanes) -> Lanes:
+        """How far across the axis the row of a side with value h stays feasible (m)."""
+        turn = game.half_axle * (game.evader_speed + self.allowance(scenario, h)) / game.pursuer_speed
+        cosine, sine = jnp.cos(game.usable_angle), jnp.sin(game.usable_angle)
+        return cosine * turn - sine * (game.capture_distance + h)
 
 
 BARRIERS: dict[str, Barrier] = {

@@ -6,7 +6,14 @@ from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.keys import episode_key
 from sidestep.trials.monte_carlo import evaluate
 from sidestep.trials.policies import as_policy
-from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
+from sidestep.trials.rollout import (
+    Episode,
+    Trajectory,
+    load_episode,
+    load_trajectory,
+    rollout,
+    save_trajectory,
+)
 from sidestep.trials.statistics import (
     interquartile_mean,
     stratified_bootstrap,
@@ -17,6 +24,7 @@ from sidestep.trials.survey import Survey, WorstEpisode, load_survey, save_surve
 
 __all__ = [
     "Capture",
+    "Episode",
     "Evaluation",
     "InterventionMap",
     "Survey",
@@ -29,6 +37,7 @@ __all__ = [
     "examine_captures",
     "explain_capture",
     "interquartile_mean",
+    "load_episode",
     "load_survey",
     "load_trajectory",
     "rollout",

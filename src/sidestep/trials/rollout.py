@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import operator
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
-from sidestep.learning.records import OUTCOMES, write_bytes
+from sidestep.learning.records import OUTCOMES, json_safe, write_bytes
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, as_shield
 from sidestep.trials.keys import as_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
-from sidestep.world import Events, Scenario, World
+from sidestep.world import Events, Scenario, World, load_scenario, scenario_to_dict
+
+_TOLD = "told"
 
 
 class Trajectory(eqx.Module):
@@ -155,28 +159,57 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as a NumPy archive of plain arrays, whole or not at all."""
+@dataclass(frozen=True)
+class Episode:
+    """A trajectory with the `scenario` it was recorded in (None: nobody said) and what else to say of it."""
+
+    trajectory: Trajectory
+    scenario: Scenario | None
+    about: Mapping[str, Any]
+
+
+def save_trajectory(
+    path: str | Path,
+    trajectory: Trajectory,
+    scenario: Scenario | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a trajectory as a NumPy archive of plain arrays, whole or not at all.
+
+    **Arguments:** `scenario` it was recorded in, and what to say `about` it as JSON values by name, `shield`
+    among them; `load_episode` gives both back.
+    """
     buffer = BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(trajectory).items()}
+    if scenario is not None:
+        told = json_safe({"scenario": scenario_to_dict(scenario), "about": about or {}})
+        arrays[_TOLD] = np.frombuffer(json.dumps(told).encode(), np.uint8)
     np.savez_compressed(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
 
 
 def load_trajectory(path: str | Path) -> Trajectory:
     """What `save_trajectory` wrote. **Raises** `ValueError` when the file is no such archive."""
+    return load_episode(path).trajectory
+
+
+def load_episode(path: str | Path) -> Episode:
+    """What `save_trajectory` wrote, with what it was told. **Raises** as `load_trajectory`."""
     place = jnp.zeros(2)
     example = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place)
     try:
         with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
-            arrays = {name: jnp.asarray(archive[name]) for name in archive.files}
+            arrays = {name: jnp.asarray(archive[name]) for name in archive.files if name != _TOLD}
+            told = json.loads(bytes(archive[_TOLD])) if _TOLD in archive.files else {}
         leaves = [arrays.pop(f"worlds.{name}") for name in _named_leaves(example)]
         worlds = jax.tree.unflatten(jax.tree.structure(example), leaves)
         events = {name: arrays.pop(name) for name in list(arrays) if name.startswith("events.")}
-        return Trajectory(
+        trajectory = Trajectory(
             worlds=worlds,
             events=Events(**{name.removeprefix("events."): values for name, values in events.items()}),
             **arrays,
         )
+        scenario = load_scenario("paper", **told["scenario"]) if told else None
+        return Episode(trajectory, scenario, told.get("about", {}))
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} holds no recorded trajectory: {error}") from error

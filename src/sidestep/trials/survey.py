@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sidestep.learning import load_policy
-from sidestep.learning.records import OUTCOMES, RunError, open_run, write_bytes
+from sidestep.learning.records import OUTCOMES, RunError, open_run, read_json, write_bytes
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.keys import episode_key, evaluation_seed
@@ -135,10 +135,11 @@ def survey_run(
 def save_survey(folder: str | Path, survey: Survey) -> None:
     """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all."""
     folder = Path(folder)
+    scenario, about = _told(folder)
     if survey.worst:
         (folder / WORST_FOLDER).mkdir(exist_ok=True)
     for episode in survey.worst:
-        save_trajectory(_worst_path(folder, episode.number), episode.trajectory)
+        save_trajectory(_worst_path(folder, episode.number), episode.trajectory, scenario, about)
     arrays: dict[str, Any] = {
         entry.name: getattr(survey.evaluation, entry.name)
         for entry in dataclasses.fields(Evaluation)
@@ -186,6 +187,15 @@ def load_survey(folder: str | Path) -> Survey | None:
             f"{path} is not readable ({error}); delete it to have the episodes run again"
         ) from error
     return Survey(evaluation, seed, worst)
+
+
+def _told(folder: Path) -> tuple[Scenario | None, dict[str, Any]]:
+    """The scenario of a run folder and what else its episodes are to say of themselves."""
+    if not (folder / "config.json").is_file():
+        return None, {}
+    config = read_json(folder / "config.json")
+    about = {name: config[name] for name in ("shield", "pursuer") if name in config}
+    return load_scenario("paper", **config["scenario"]), about
 
 
 def _policy_digest(folder: Path) -> str:

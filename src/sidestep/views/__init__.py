@@ -1,5 +1,6 @@
-"""What people see: figures and the report."""
+"""What people see: figures, animations and the report."""
 
+from sidestep.views.animation import animate
 from sidestep.views.capture_figure import capture_figure
 from sidestep.views.certificate_figure import certificate_figure
 from sidestep.views.clearance_figure import clearance_figure
@@ -11,6 +12,7 @@ from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, 
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
 from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
 from sidestep.views.twin_figure import twin_figure
+from sidestep.views.video_files import VideoError
 
 __all__ = [
     "CAPTURE_FILE",
@@ -18,6 +20,8 @@ __all__ = [
     "SCENE_FILE",
     "Run",
     "Section",
+    "VideoError",
+    "animate",
     "capture_figure",
     "certificate_figure",
     "clearance_figure",

@@ -13,6 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from sidestep.trials import Trajectory
+from sidestep.views.motion import relative
+from sidestep.views.outlines import pursuer_heights
 from sidestep.views.scene import (
     capture_set_outline,
     draw_capture_set,
@@ -133,11 +135,7 @@ def _draw_scene(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: i
 def _draw_seen(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer: int, first: int) -> None:
     """The path of z = R(-theta)(p_e - p_d)."""
     poses = np.asarray(trajectory.worlds.pursuers)[first:, pursuer]
-    offset = np.asarray(trajectory.worlds.evader)[first:] - poses[:, :2]
-    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    z = np.stack(
-        [cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]], axis=-1
-    )
+    z = relative(np.asarray(trajectory.worlds.evader)[first:], poses)
     outline = capture_set_outline(scenario)
     span = 2.2 * float(np.abs(outline).max())
     set_limits(axes, np.array([[-span, -span], [span, span]]) / 1.15, 0.0)
@@ -183,15 +181,8 @@ def _draw_gaps(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: in
 
 def _margins(scenario: Scenario, trajectory: Trajectory) -> np.ndarray:
     """h (m) towards the capture set, the least over pursuers, at each instant."""
-    poses = np.asarray(trajectory.worlds.pursuers)
-    offset = np.asarray(trajectory.worlds.evader)[:, None] - poses[..., :2]
-    ahead = np.abs(np.cos(poses[..., 2]) * offset[..., 0] + np.sin(poses[..., 2]) * offset[..., 1])
-    aside = np.abs(np.cos(poses[..., 2]) * offset[..., 1] - np.sin(poses[..., 2]) * offset[..., 0])
-    usable = float(scenario.usable_angle)
-    slanted = ahead * np.cos(usable) + aside * np.sin(usable)
-    in_front = aside * np.cos(usable) < ahead * np.sin(usable)
-    h = np.where(in_front, slanted, np.hypot(ahead, aside)) - float(scenario.capture_distance)
-    return h.min(axis=1)
+    evader, poses = np.asarray(trajectory.worlds.evader), np.asarray(trajectory.worlds.pursuers)
+    return pursuer_heights(scenario, evader[:, None], poses, pursuit=True).min(axis=1)
 
 
 def _draw_wheels(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer: int, first: int) -> None:

@@ -15,6 +15,7 @@ from matplotlib.patches import Arc, Circle, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from sidestep.trials import InterventionMap
+from sidestep.views.outlines import PURSUIT_SHIELDS
 from sidestep.views.scene import capture_set_outline, correction_colours
 from sidestep.views.style import (
     COLUMN,
@@ -37,7 +38,6 @@ _ARROWS = 15
 _LEAST_SIDE = 1.3
 """Inches; with more shields than fit a page at this size the figure becomes wider."""
 _HALO = [withStroke(linewidth=2.0, foreground="white")]
-_PURSUIT_SHIELDS = ("game", "joint")
 
 
 def intervention_figure(
@@ -77,7 +77,7 @@ def intervention_figure(
                     np.where(visited, values, np.nan), origin="lower", extent=extent, cmap=colours, norm=norm,
                     interpolation="nearest", zorder=1,
                 )  # fmt: skip
-                _draw_sets(axes, scenario, one.reach, pursuit=name in _PURSUIT_SHIELDS)
+                _draw_sets(axes, scenario, one.reach, pursuit=name in PURSUIT_SHIELDS)
             _draw_directions(grid[1, column], one)
         for row, (colours, norm, words) in enumerate(bars):
             bar = figure.colorbar(

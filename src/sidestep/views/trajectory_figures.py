@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 
 from sidestep.safety import Status
 from sidestep.trials import Trajectory
+from sidestep.views.outlines import PURSUIT_SHIELDS
 from sidestep.views.scene import (
     correction_colours,
     draw_barrier_levels,
@@ -48,7 +49,6 @@ from sidestep.views.style import (
 from sidestep.world import Scenario
 
 _BARRIER_TICKS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.0)
-_PURSUIT_SHIELDS = ("game", "joint")
 
 
 def trajectory_figure(
@@ -84,14 +84,17 @@ def trajectory_figure(
         norm = correction_norm(scenario)
         draw_scene(scene, scenario, trajectory, norm, shield=shield, period=period)
         scene_legend(key, trajectory)
-        _draw_barriers(barriers, scenario, trajectory, period)
-        _draw_corrections(corrections, scenario, trajectory, norm, period)
+        draw_barriers(barriers, scenario, trajectory)
+        draw_corrections(corrections, scenario, trajectory, norm)
+        now, duration = (count * float(scenario.control_period) for count in (period, trajectory.length))
+        for strip in (barriers, corrections):
+            _mark_moment(strip, now)
+        _say_moment(barriers, now, duration)
         _draw_answers(answers, scenario, trajectory)
         for upper in (barriers, corrections):
             upper.sharex(answers)
             upper.tick_params(axis="x", labelbottom=False)
         words = f"{shield_words(shield)}: " if shield else ""
-        duration = trajectory.length * float(scenario.control_period)
         heading = title or f"{words}{OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
         panel_titles(
             [scene, barriers, corrections, answers],
@@ -192,7 +195,7 @@ def draw_scene(
     set_limits(axes, np.stack(corners), scene_margin(scenario))
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
-    draw_barrier_levels(axes, scenario, world, pursuit=shield in _PURSUIT_SHIELDS)
+    draw_barrier_levels(axes, scenario, world, pursuit=shield in PURSUIT_SHIELDS)
     length = float(scenario.control_period)
     marks = mark_periods(trajectory.length * length, length)
     draw_obstacles(axes, scenario, trajectory, period, marks)
@@ -264,7 +267,8 @@ def _shade_infeasible(axes: Axes, scenario: Scenario, trajectory: Trajectory) ->
         axes.axvspan(begin, begin + duration, color=PURSUER, alpha=0.18, linewidth=0)
 
 
-def _draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory, period: int) -> None:
+def draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
+    """h towards every pursuer and obstacle over time, on a square-root scale."""
     times, values = _times(scenario, trajectory), np.asarray(trajectory.barriers)
     pursuers = trajectory.worlds.pursuers.shape[1]
     light_grid(axes, "y")
@@ -288,33 +292,23 @@ def _draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory, perio
     ticks = [tick for tick in _BARRIER_TICKS if tick <= 1.1 * highest]
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_ylabel("h, m (√ scale)")
-    now = period * float(scenario.control_period)
-    axes.axvline(now, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
-    late = now > 0.8 * trajectory.length * float(scenario.control_period)
-    axes.annotate(
-        "drawn above", (now, 1.0), xycoords=axes.get_xaxis_transform(), xytext=(-3 if late else 3, -2),
-        textcoords="offset points", ha="right" if late else "left", va="top", fontsize=6.5,
-    )  # fmt: skip
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, borderpad=0.1, borderaxespad=0.0)
 
 
-def _draw_corrections(
-    axes: Axes, scenario: Scenario, trajectory: Trajectory, norm: Normalize, period: int
-) -> None:
+def draw_corrections(axes: Axes, scenario: Scenario, trajectory: Trajectory, norm: Normalize) -> None:
+    """How far the shield changed the velocity over time, in the colours of the path."""
     times, correction = _times(scenario, trajectory), np.asarray(trajectory.intervention)
-    length = float(scenario.control_period)
     light_grid(axes, "y")
     _shade_infeasible(axes, scenario, trajectory)
     axes.bar(
         times,
         correction,
-        width=length,
+        width=float(scenario.control_period),
         align="edge",
         color=correction_colours()(norm(correction)),
         linewidth=0,
     )
     axes.step(times, correction, where="post", color=INK, linewidth=0.5)
-    axes.axvline(period * length, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.set_ylim(0.0, 2.1 * float(scenario.evader_speed))
     axes.set_ylabel("m/s")
     if np.max(correction, initial=0.0) <= 1e-6:
@@ -323,7 +317,19 @@ def _draw_corrections(
         )
 
 
-_ANSWERS = {
+def _mark_moment(axes: Axes, now: float) -> None:
+    axes.axvline(now, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+
+
+def _say_moment(axes: Axes, now: float, duration: float) -> None:
+    late = now > 0.8 * duration
+    axes.annotate(
+        "drawn above", (now, 1.0), xycoords=axes.get_xaxis_transform(), xytext=(-3 if late else 3, -2),
+        textcoords="offset points", ha="right" if late else "left", va="top", fontsize=6.5,
+    )  # fmt: skip
+
+
+ANSWERS = {
     Status.OK: ("#DDDDDD", "unchanged"),
     Status.CORRECTED: (BLUE, "corrected"),
     Status.INFEASIBLE: (PURSUER, "not all rows can hold"),
@@ -334,7 +340,7 @@ _ANSWERS = {
 def _draw_answers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
     """The status of every control period as a strip, with a key of those that occur and how often."""
     status, handles = np.asarray(trajectory.status), []
-    for value, (colour, words) in _ANSWERS.items():
+    for value, (colour, words) in ANSWERS.items():
         share = float(np.mean(status == value)) if len(status) else 0.0
         if share:
             # A bar per stretch, not per period: thousands of hairlines would not print.

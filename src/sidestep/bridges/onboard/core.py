@@ -89,8 +89,9 @@ class Onboard:
         noise = settings.position_noise, settings.heading_noise
         rim, axle = float(scenario.pursuer_speed), float(scenario.pursuer_half_axle)
         drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
-        tracking = max(float(settings.budget.tracking_error), 0.02 * self._speed)
-        self._evader = EvaderTrack(*noise, tracking, settings.actuation_delay)
+        tracking = max(float(settings.budget.tracking_error), 0.05 * self._speed)
+        motors = settings.actuation_delay, settings.motor_lag, settings.motor_acceleration
+        self._evader = EvaderTrack(*noise, tracking, *motors)
         self._pursuers = [PursuerTrack(*noise, rim, axle) for _ in range(scenario.pursuer_count)]
         self._obstacles = [
             ObstacleTrack(noise[0], drift, settings.obstacle_acceleration)
@@ -196,7 +197,7 @@ class Onboard:
         level = max(level, int(self._late_in_a_row > 0 or self._behind))
         self._now = now
 
-        acts = now + self.settings.actuation_delay
+        acts = now + self.settings.response
         unseen = self._unseen()
         if unseen:
             reactions.append(f"{', '.join(unseen)} not seen yet: standing still")
@@ -292,14 +293,14 @@ class Onboard:
     def _ages(self, now: float, reactions: list[str]) -> tuple[float, int]:
         """From the oldest pursuer's pose to when the command acts (s), and the level that all ages leave."""
         settings, level, delay = self.settings, 0, 0.0
-        usual = max(float(settings.budget.delay) - settings.actuation_delay, 0.0) + self._period
+        usual = max(float(settings.budget.delay) - settings.response, 0.0) + self._period
         for robot, gates in self._gates.items():
             for index, gate in enumerate(gates):
                 assert gate.track.stamp is not None
                 age = now - gate.track.stamp
                 # Evader and obstacles are where their known motion has taken them.
                 if robot == "pursuer":
-                    delay = max(delay, age + settings.actuation_delay)
+                    delay = max(delay, self._unpredicted(age))
                 if age <= usual:
                     continue
                 name, milliseconds = _name(robot, index), 1e3 * age
@@ -312,6 +313,14 @@ class Onboard:
                 left = "standing still" if stops else "fleeing from where it may be"
                 reactions.append(f"{name}: stale, last seen {milliseconds:.0f} ms ago: {left}")
         return delay, level
+
+    def _unpredicted(self, age: float) -> float:
+        """The delay (s) that a pursuer's pose of this age is to be paid for."""
+        settings = self.settings
+        if not settings.predict_pursuer:
+            return age + settings.response
+        # Driven on to when the command acts; what that is worth fades with the age.
+        return float(settings.budget.delay) + max(age - self._period, 0.0)
 
     def _wished(self, now: float, reactions: list[str]) -> tuple[Numbers, bool]:
         """The wish to filter, and whether it was lost; a policy's is computed with the decision."""

@@ -17,9 +17,12 @@ class OnboardSettings:
 
     **Errors.** `budget` bounds what the rows must allow for. `position_noise` (m) and `heading_noise` (rad)
     are standard deviations of the poses, for the filters that average them. `actuation_delay` (s) is the part
-    of the delay that passes between a decision and the motors: the own motion is predicted up to there.
-    `predict_pursuer`: also drive the pursuer on from its last pose at the speeds that it seems to have. What
-    is guaranteed holds without (an old pose is the same game, `budget.delay` pays for it); with it, a pursuer
+    of the delay that passes between a decision and the motors. They then go to the velocity told with the
+    time constant `motor_lag` (s), and no faster than `motor_acceleration` (m/s^2). The own motion is
+    predicted with these; a command is taken to act `actuation_delay + motor_lag` late, and a pursuer's pose
+    is paid for by its age and that, or by `budget.delay` if that is more. `predict_pursuer`: drive the
+    pursuer on to then, at the speeds that it seems to have, and pay for `budget.delay` and what a pose is
+    older than a period. What is guaranteed holds without (an old pose is the same game); with it, a pursuer
     that drives steadily is met better and one that turns round within the delay worse. An obstacle's drift is
     taken to wander by `obstacle_acceleration` (m/s per root second).
 
@@ -34,6 +37,8 @@ class OnboardSettings:
     position_noise: float = 0.001
     heading_noise: float = 0.005
     actuation_delay: float = 0.0
+    motor_lag: float = 0.0
+    motor_acceleration: float = math.inf
     predict_pursuer: bool = False
     obstacle_acceleration: float = 0.005
     stale_after: float = 0.2
@@ -50,11 +55,13 @@ class OnboardSettings:
         wrong = [
             f"{name} = {getattr(self, name)!r}: it must be a finite number, 0 or more"
             for name in (
-                "position_noise", "heading_noise", "actuation_delay", "obstacle_acceleration", "stale_after",
-                "nominal_timeout", "jump_tolerance", "heading_tolerance", "future_tolerance",
+                "position_noise", "heading_noise", "actuation_delay", "motor_lag", "obstacle_acceleration",
+                "stale_after", "nominal_timeout", "jump_tolerance", "heading_tolerance", "future_tolerance",
             )
             if not _is_number(getattr(self, name), 0.0)
         ]  # fmt: skip
+        if not self.motor_acceleration > 0.0:
+            wrong.append(f"motor_acceleration = {self.motor_acceleration!r}: it must be more than 0 m/s^2")
         if not _is_number(self.late_after, 1.0):
             wrong.append(f"late_after = {self.late_after!r}: it must be at least 1 period")
         for name in ("jump_confirmations", "late_limit"):
@@ -64,6 +71,11 @@ class OnboardSettings:
             wrong.append(f"on_fault = {self.on_fault!r}: use one of {', '.join(map(repr, ON_FAULT))}")
         if wrong:
             raise ValueError("onboard settings: " + "; ".join(wrong))
+
+    @property
+    def response(self) -> float:
+        """From a decision to when its command acts, s."""
+        return self.actuation_delay + self.motor_lag
 
 
 def _is_number(value: object, least: float) -> bool:

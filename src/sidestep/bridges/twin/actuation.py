@@ -9,7 +9,7 @@ from typing import Generic, TypeVar, final
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.bridges.twin.robots import OMNIWHEEL_ANGLES, OMNIWHEEL_ARM, OMNIWHEEL_RADIUS
+from sidestep.bridges.twin.robots import OMNIWHEEL_ANGLES, OMNIWHEEL_ARM, OMNIWHEEL_RADIUS, OMNIWHEEL_ROLLING
 
 _YAW_GAIN = 1.5
 _MOST_YAW_RATE = 0.5
@@ -44,15 +44,13 @@ def omniwheel_speeds(velocity: Float[np.ndarray, "2"], heading: float) -> Float[
     """Speeds (rad/s) of the three omniwheels for a velocity (m/s) in world axes, heading (rad) held at 0.
 
     With t the direction in which a wheel rolls the base along, counter-clockwise about its centre, the axle
-    pointing outwards and L the wheel's distance: R w = -(v.t + L yaw rate), v in the robot's axes.
+    pointing outwards and L the wheel's distance: R w = -(v.t + L yaw rate), v in the robot's axes, and R the
+    radius that the wheels roll with.
     """
     cosine, sine = math.cos(heading), math.sin(heading)
     ahead = cosine * velocity[0] + sine * velocity[1]
     left = cosine * velocity[1] - sine * velocity[0]
-    turn = OMNIWHEEL_ARM * yaw_rate(heading)
+    turn, radius = OMNIWHEEL_ARM * yaw_rate(heading), OMNIWHEEL_RADIUS * OMNIWHEEL_ROLLING
     return np.array(
-        [
-            -(left * math.cos(angle) - ahead * math.sin(angle) + turn) / OMNIWHEEL_RADIUS
-            for angle in OMNIWHEEL_ANGLES
-        ]
+        [-(left * math.cos(angle) - ahead * math.sin(angle) + turn) / radius for angle in OMNIWHEEL_ANGLES]
     )

@@ -7,6 +7,8 @@ import os
 import sys
 from typing import Any
 
+from sidestep.views import video_files
+
 _LIBRARIES = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
 _INSTALL = "pip install 'sidestep[twin]'"
 
@@ -46,10 +48,9 @@ def offscreen_backend() -> str | None:
 def load_av() -> Any:
     """The module `av` (PyAV), which writes video files. **Raises** `TwinError` when it is not installed."""
     try:
-        import av
-    except ModuleNotFoundError as error:
-        raise TwinError(f"writing a video needs PyAV: {_INSTALL}") from error
-    return av
+        return video_files.load_av("twin")
+    except video_files.VideoError as error:
+        raise TwinError(str(error)) from error
 
 
 def make_renderer(model: Any, height: int, width: int, most_shapes: int) -> Any:

@@ -20,6 +20,9 @@ WHEEL_RADIUS = 0.05
 """Radius of the pursuer's driven wheels, m."""
 OMNIWHEEL_RADIUS, OMNIWHEEL_ARM = 0.04, 0.085
 """Radius of an omniwheel and its distance from the evader's centre, m."""
+OMNIWHEEL_ROLLING = 0.9863
+"""What a turn of the wheels makes of the way that it should: rollers slip and motors under load droop. The
+base is calibrated by this, as one is by driving it straight at full speed and measuring."""
 OMNIWHEEL_ANGLES = tuple(math.radians(angle) for angle in (60.0, 180.0, 300.0))
 """Directions of the omniwheels' axles from the evader's centre, rad from its x axis."""
 _ROLLERS = 10

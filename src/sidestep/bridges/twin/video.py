@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import closing
-from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from sidestep.bridges.twin.episode import TwinEpisode
 from sidestep.bridges.twin.library import load_av, load_mujoco, make_renderer
 from sidestep.bridges.twin.twin import Twin
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER, TARGET
+from sidestep.views.video_files import write_video_file
 
 _SIZE = (540, 960)
 _RING = 72
@@ -159,29 +159,9 @@ def write_video(
     """Write an episode as an MP4 video (H.264) of `rate` frames per second, `speed` times as fast as it was.
 
     It ends with one second of the last frame. **Raises** `TwinError` when PyAV or off-screen rendering is
-    missing.
+    missing, and as `write_video_file`.
     """
-    av = load_av()
-    path = Path(path)
+    load_av()
     times = np.arange(0.0, episode.frame_times[-1], speed / rate)
     frames = frames_of(episode, np.append(times, episode.frame_times[-1]), size)
-    first = next(frames)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(rate), options={"crf": "23"})
-        stream.height, stream.width = first.shape[:2]
-        stream.pix_fmt = "yuv420p"
-
-        def write(picture: np.ndarray, times: int = 1) -> None:
-            for _ in range(times):
-                for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")):
-                    container.mux(packet)
-
-        picture = first
-        write(picture)
-        for picture in frames:
-            write(picture)
-        write(picture, rate)
-        for packet in stream.encode():
-            container.mux(packet)
-    return path
+    return write_video_file(path, frames, rate, hold=1.0)

@@ -50,7 +50,7 @@ Saver = Callable[[Path, Trajectory, Scenario, Mapping[str, Any]], None]
 
 
 def _save_npz(path: Path, trajectory: Trajectory, scenario: Scenario, about: Mapping[str, Any]) -> None:
-    save_trajectory(path, trajectory)
+    save_trajectory(path, trajectory, scenario, about)
 
 
 @dataclass(frozen=True)

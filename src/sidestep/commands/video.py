@@ -1,0 +1,75 @@
+"""What the commands with an episode share: options of its video, checked before any work is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from sidestep.commands.common import CountBar
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Video:
+    """An animation of the episode: the world, the pursuer's frame and the shield's trace."""
+
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also animate it into this .mp4, .gif or .webp file; never over a file that exists."""
+    video_speed: float = 1.0
+    """How many times faster than it was."""
+    video_rate: int | None = None
+    """Pictures per second; 30, or 20 for .gif and .webp, by default."""
+    video_width: int | None = None
+    """Pixels; 1280, or 720 for .gif and .webp, by default. The height is 9/16 of it."""
+    video_levels: Annotated[tuple[float, ...], tyro.conf.arg(metavar="[M ...]")] = (0.1, 0.2, 0.3)
+    """Levels of the barrier to draw beside level 0, in m; none make a .gif or .webp half as large."""
+
+
+NO_VIDEO = Video()
+VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
+"""The options under their own names, in a group of their own."""
+
+
+def check_options(options: Video) -> None:
+    """Raises `ValueError` for a video that cannot be written as asked; nothing is checked if none is."""
+    if options.video is None:
+        return
+    from sidestep.views.animation import check_numbers
+    from sidestep.views.video_files import check_video
+
+    check_numbers(
+        check_video(options.video, overwrite=False),
+        speed=options.video_speed,
+        rate=options.video_rate,
+        width=options.video_width,
+        levels=options.video_levels,
+    )
+
+
+def write_video(
+    options: Video, scenario: Any, trajectory: Any, shield: str, console: Console, what: str = "the episode"
+) -> None:
+    """Animate an episode if that was asked for, and say where."""
+    if options.video is None:
+        return
+    from sidestep.views import animate
+
+    with CountBar(console, "video") as show:
+        path = animate(
+            scenario,
+            trajectory,
+            options.video,
+            shield=shield,
+            speed=options.video_speed,
+            rate=options.video_rate,
+            width=options.video_width,
+            levels=options.video_levels,
+            progress=show,
+        )
+    outcome = trajectory.outcome.replace("_", " ")
+    console.print(f"Video of {what} ({outcome}): {path}", highlight=False, soft_wrap=True)

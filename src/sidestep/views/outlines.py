@@ -1,0 +1,89 @@
+"""Where are the levels of a barrier? Their outlines, worked out instead of searched for on a grid."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.views.motion import relative
+from sidestep.views.scene import capture_set_outline, to_world
+from sidestep.world import Scenario
+
+PURSUIT_SHIELDS = ("game", "joint")
+"""Shields whose barrier towards a pursuer is that of the game; others keep a distance."""
+
+_POINTS = 121
+
+
+def pursuer_heights(
+    scenario: Scenario,
+    points: Float[np.ndarray, "... 2"],
+    pose: Float[np.ndarray, "... 3"],
+    *,
+    pursuit: bool,
+) -> Float[np.ndarray, "..."]:
+    """h (m) of evader positions towards pursuers: the game's barrier with `pursuit`, else |p_e - p_d| - l.
+
+    The game's is the signed distance from the capture set K, which is |x| cos S + |y| sin S - l in front of
+    the pursuer and behind it, and |z| - l aside.
+    """
+    usable = float(scenario.usable_angle) if pursuit else None
+    return _heights(points, pose, float(scenario.capture_distance), usable)
+
+
+def _heights(points: np.ndarray, pose: np.ndarray, capture: float, usable: float | None) -> np.ndarray:
+    ahead, aside = np.moveaxis(np.abs(relative(points, pose)), -1, 0)
+    apart = np.hypot(ahead, aside)
+    if usable is not None:
+        slanted = ahead * np.cos(usable) + aside * np.sin(usable)
+        apart = np.where(aside * np.cos(usable) < ahead * np.sin(usable), slanted, apart)
+    return apart - capture
+
+
+@final
+class LevelOutlines:
+    """Where the least barrier over all robots has a certain value, all but the evader held in place.
+
+    Around each robot the level c > 0 of its own barrier has the shape of its level 0, only larger by c; the
+    parts of it at which another barrier is lower are left out. `pursuit` as for `pursuer_heights`.
+    """
+
+    def __init__(self, scenario: Scenario, *, pursuit: bool):
+        self._usable = float(scenario.usable_angle) if pursuit else None
+        self._capture, self._collision = float(scenario.capture_distance), float(scenario.collision_distance)
+        angles = np.linspace(0.0, 2.0 * np.pi, _POINTS)
+        self._circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        self._shape = self._circle
+        if pursuit:
+            self._shape = _dense(capture_set_outline(scenario, _POINTS)) / self._capture
+
+    def at(
+        self, poses: Float[np.ndarray, "m 3"], obstacles: Float[np.ndarray, "k 2"], level: float
+    ) -> Float[np.ndarray, "n 2"]:
+        """The level (m) around pursuers and obstacles: closed, NaN between them and where they are cut."""
+        outlines = [to_world((self._capture + level) * self._shape, pose) for pose in poses]
+        outlines += [centre + (self._collision + level) * self._circle for centre in obstacles]
+        for one, outline in enumerate(outlines):
+            outside = np.ones(len(outline), bool)
+            for other, pose in enumerate(poses):
+                if other != one:
+                    outside &= _heights(outline, pose, self._capture, self._usable) >= level
+            for other, centre in enumerate(obstacles, start=len(poses)):
+                if other != one:
+                    outside &= np.hypot(*(outline - centre).T) - self._collision >= level
+            outline[~outside] = np.nan
+        gap = np.full((1, 2), np.nan)
+        return np.concatenate([part for outline in outlines for part in (outline, gap)])
+
+
+def _dense(outline: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """The same outline with more points on its straight parts, so that it can be cut there."""
+    longest = 2.0 * np.median(np.hypot(*np.diff(outline, axis=0).T))
+    parts = []
+    for start, end in pairwise(outline):
+        count = max(1, int(np.ceil(np.hypot(*(end - start)) / longest)))
+        parts.append(start + np.arange(count)[:, None] / count * (end - start))
+    return np.concatenate([*parts, outline[-1:]])

@@ -1,0 +1,241 @@
+"""How do pictures become a video file: .mp4, .gif or .webp, whole or not at all?"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain, islice, repeat
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from sidestep.learning.records import whole_file
+
+Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
+
+SUFFIXES = (".mp4", ".gif", ".webp")
+_INSTALL = "pip install 'sidestep[video]'"
+_H264 = {"crf": "21", "preset": "veryfast", "tune": "animation"}
+"""Quality 21: 18 is hardly to be told from the original, 28 looks worn. Slower presets gain nothing here."""
+_COLOURS = 127
+"""Of the 128 entries of a palette, the last one stands for what has not changed."""
+_EXACT = 32
+"""How many colours get an entry because they are frequent."""
+
+
+class VideoError(ValueError):
+    """A video that cannot be written as asked; the message says what to change or to install."""
+
+
+def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
+    """The path, if a video can be written there: asked before any work is done.
+
+    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot
+    be written to, for a file that exists unless `overwrite`, and when the package that writes it is not
+    installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise VideoError(f"{path} must end in one of {', '.join(SUFFIXES)}: it says what to write")
+    if path.is_dir():
+        raise VideoError(f"{path} is a folder; give the video a name in it")
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise VideoError(f"{path} cannot be written: {folder} is no folder that one can write to")
+    if path.exists() and not overwrite:
+        raise VideoError(f"{path} exists already; give the video another name")
+    if path.suffix.lower() == ".mp4":
+        load_av()
+    else:
+        _load_pillow(path.suffix.lower())
+    return path
+
+
+def load_av(extra: str = "video") -> Any:
+    """The module `av` (PyAV), which writes MP4 files.
+
+    **Raises** `VideoError` when it is not installed; it names the extra that installs it.
+    """
+    try:
+        return importlib.import_module("av")
+    except ModuleNotFoundError as error:
+        raise VideoError(f"writing an MP4 video needs PyAV: pip install 'sidestep[{extra}]'") from error
+
+
+def _load_pillow(suffix: str) -> Any:
+    try:
+        image, features = (importlib.import_module(f"PIL.{name}") for name in ("Image", "features"))
+    except ModuleNotFoundError as error:
+        raise VideoError(f"writing a {suffix} animation needs Pillow: {_INSTALL}") from error
+    if suffix == ".webp" and not features.check("webp"):
+        raise VideoError(f"this Pillow was built without WebP; {_INSTALL}, or write .gif")
+    return image
+
+
+def write_video_file(
+    path: str | Path,
+    pictures: Pictures,
+    rate: int,
+    *,
+    hold: float = 0.0,
+    samples: Pictures | None = None,
+) -> Path:
+    """Write pictures as a video; the suffix of `path` says which. Folders on the way to it are made.
+
+    MP4 is H.264 with 4:2:0 colours and its index in front, which browsers and players play at once. GIF and
+    WebP have one palette for all pictures, without dithering, and repeat for ever; what is drawn stays as
+    sharp as it was, photographs would not.
+
+    **Arguments:** `pictures` in RGB, one after the other: an MP4 of any length needs the memory of one, GIF
+    and WebP that of a byte per pixel and picture; `rate` pictures per second; `hold` how long (s) the last
+    one stays; `samples` pictures to choose the palette from (the first one if not given).
+
+    **Raises** as `check_video`, and `VideoError` for an odd size of an MP4 or no picture at all. Whatever
+    happens, no part of a file is left.
+    """
+    path = check_video(path)
+    if rate < 1 or hold < 0.0:
+        raise VideoError(
+            f"rate = {rate}, hold = {hold}: a rate of at least 1 and no negative hold are needed"
+        )
+    stream = iter(pictures)
+    first = next(stream, None)
+    if first is None:
+        raise VideoError("no picture, no video")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as beside:
+        if path.suffix.lower() == ".mp4":
+            _write_mp4(beside, chain([first], stream), first.shape[:2], rate, hold)
+        else:
+            palette = _Palette([first] if samples is None else samples)
+            write = _write_gif if path.suffix.lower() == ".gif" else _write_webp
+            write(beside, chain([first], stream), palette, rate, hold)
+    return path
+
+
+def _write_mp4(path: Path, pictures: Pictures, size: tuple[int, ...], rate: int, hold: float) -> None:
+    av = load_av()
+    height, width = size
+    if height % 2 or width % 2:
+        raise VideoError(f"{width} x {height} pixels: an MP4 needs even numbers")
+    # Players take large pictures for BT.709 and small ones for something else unless told.
+    space = av.video.reformatter.Colorspace.ITU709
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=Fraction(rate), options=_H264)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        context = stream.codec_context
+        context.color_range, context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1, 1
+        last = None
+        for picture in pictures:
+            last = np.ascontiguousarray(picture)
+            container.mux(stream.encode(_as_frame(av, last, space)))
+        for picture in repeat(last, round(hold * rate)):
+            container.mux(stream.encode(_as_frame(av, picture, space)))
+        container.mux(stream.encode())
+
+
+def _as_frame(av: Any, picture: Any, space: Any) -> Any:
+    frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+    return frame.reformat(format="yuv420p", dst_colorspace=space, dst_color_range=1)
+
+
+def _write_gif(path: Path, pictures: Pictures, palette: _Palette, rate: int, hold: float) -> None:
+    durations = _Durations(rate, hold, unit=10)
+    shown = _indexed(pictures, palette, durations)
+    # Pillow would leave a file open that it opened itself, when it is interrupted.
+    with open(path, "wb") as file:
+        next(shown).save(
+            file, format="GIF", save_all=True, append_images=shown, duration=durations, loop=0, optimize=True,
+            palette=palette.colours.tobytes(), transparency=_COLOURS, disposal=1,
+        )  # fmt: skip
+
+
+def _write_webp(path: Path, pictures: Pictures, palette: _Palette, rate: int, hold: float) -> None:
+    durations = _Durations(rate, hold, unit=1)
+    shown = _indexed(pictures, palette, durations)
+    with open(path, "wb") as file:
+        # Without key frames, which nobody needs in what is played from the beginning.
+        next(shown).save(
+            file, format="WEBP", save_all=True, append_images=shown, duration=durations, loop=0,
+            lossless=True, quality=60, method=2, kmin=0, kmax=0,
+        )  # fmt: skip
+
+
+class _Durations(list[int]):
+    """How long (ms) each picture is shown, in whole units of the format: rounded without drifting."""
+
+    def __init__(self, rate: int, hold: float, unit: int):
+        super().__init__()
+        self._length, self._hold, self._unit = 1000.0 / rate / unit, 1000.0 * hold / unit, unit
+
+    def next(self, last: bool) -> None:
+        """One more picture; the last one stays for the hold, too."""
+        begin, end = len(self) * self._length, (len(self) + 1) * self._length
+        self.append(self._unit * (round(end + (self._hold if last else 0.0)) - round(begin)))
+
+
+def _indexed(pictures: Pictures, palette: _Palette, durations: _Durations) -> Iterator[Any]:
+    """The pictures with palette, each after its duration has been noted."""
+    stream = iter(pictures)
+    now = next(stream, None)
+    while now is not None:
+        following = next(stream, None)
+        durations.next(last=following is None)
+        yield palette.image(now)
+        now = following
+
+
+@final
+class _Palette:
+    """127 colours for pictures like the samples, and one more that no picture gets.
+
+    The most frequent colours, which are those of areas, exactly; of the others, some from wherever there
+    are any, however rare, since a target is small. Pillow's own assignment would turn white into nearly
+    white; this one takes the nearest colour, and remembers it.
+    """
+
+    def __init__(self, samples: Pictures):
+        self._pillow = _load_pillow(".gif")
+        packed = np.concatenate([_packed(picture) for picture in samples])
+        found, counts = np.unique(packed, return_counts=True)
+        found = found[np.argsort(-counts, kind="stable")]
+        exact = _EXACT if len(found) > _COLOURS else _COLOURS
+        kept, others = found[:exact], found[exact:]
+        if len(others):
+            rest = self._pillow.fromarray(_unpacked(others)[None])
+            groups = rest.quantize(_COLOURS - len(kept), self._pillow.Quantize.MAXCOVERAGE)
+            grouped = np.asarray(groups.getpalette(), np.uint8).reshape(-1, 3)
+            kept = np.unique(np.concatenate([kept, _packed(grouped)]))
+        taken = set(kept.tolist())
+        spare = islice((colour for colour in range(1 << 24) if colour not in taken), _COLOURS + 1 - len(kept))
+        self.colours = _unpacked(np.concatenate([kept, np.fromiter(spare, kept.dtype)]))
+        self._nearest = np.full(1 << 24, _COLOURS, np.uint8)
+
+    def image(self, picture: UInt8[np.ndarray, "height width 3"]) -> Any:
+        """The picture as one of Pillow's, with this palette."""
+        packed = _packed(picture)
+        index = self._nearest[packed]
+        new = np.unique(packed[index == _COLOURS])
+        if len(new):
+            palette = self.colours[:_COLOURS].astype(np.float32)
+            colours = _unpacked(new).astype(np.float32)
+            # |a - b|^2 without the part that is the same for all b.
+            apart = np.sum(palette**2, axis=-1) - 2.0 * colours @ palette.T
+            self._nearest[new] = np.argmin(apart, axis=-1)
+            index = self._nearest[packed]
+        image = self._pillow.fromarray(index.reshape(picture.shape[:2]))
+        image.putpalette(self.colours.tobytes())
+        return image
+
+
+def _packed(colours: np.ndarray) -> np.ndarray:
+    red, green, blue = np.moveaxis(colours.reshape(-1, 3).astype(np.uint32), -1, 0)
+    return red << 16 | green << 8 | blue
+
+
+def _unpacked(colours: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
+    return np.stack([colours >> 16, colours >> 8 & 255, colours & 255], axis=-1).astype(np.uint8)
