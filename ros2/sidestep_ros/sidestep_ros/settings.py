@@ -7,8 +7,8 @@ from sidestep_ros.parameters import ConfigurationError
 
 _OF_ONBOARD = (
     "position_noise", "heading_noise", "actuation_delay", "motor_lag", "motor_acceleration",
-    "predict_pursuer", "obstacle_acceleration", "stale_after", "nominal_timeout", "on_fault", "jump_tolerance", "heading_tolerance",
-    "jump_confirmations", "future_tolerance",
+    "predict_pursuer", "obstacle_acceleration", "stale_after", "nominal_timeout", "on_fault",
+    "jump_tolerance", "heading_tolerance", "jump_confirmations", "future_tolerance",
 )  # fmt: skip
 """Parameters that are fields of `OnboardSettings` by the same name."""
 

@@ -104,16 +104,16 @@ def _start(scenario: Scenario, seed: Array) -> tuple[World, PRNGKeyArray]:
 def settings_for(options: TwinOptions) -> OnboardSettings:
     """What the decision core is told of the twin's sensors and motors.
 
-    Filters average the noise, and predict the pursuer to when a command acts: half a standard deviation is
-    allowed for in place, a quarter of one in heading, and the delay of the poses without that of the motors,
-    which is modelled. That is what bounded errors leave of the paper's numbers, not what bounds the errors
-    (`bounded_errors` does): an evader that keeps more is led round in circles and does not arrive, one that
-    keeps less is caught.
+    Filters average the noise, and predict the pursuer to when a command acts: a standard deviation is allowed
+    for in place, a quarter of one in heading, and the delay of the poses without that of the motors, which is
+    modelled. That is what the paper's numbers leave some use of, not what bounds the errors (`bounded_errors`
+    does): an evader that keeps more is led round in circles and does not arrive, one that keeps less is
+    caught.
     """
     sensors = options.sensors
     return OnboardSettings(
         budget=Budget(
-            position_error=0.5 * sensors.position_noise,
+            position_error=sensors.position_noise,
             heading_error=0.25 * sensors.heading_noise,
             delay=sensors.bounds()["delay"] + options.actuation_delay,
         ),
