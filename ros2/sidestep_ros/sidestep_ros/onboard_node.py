@@ -15,6 +15,7 @@ from visualization_msgs.msg import MarkerArray
 from sidestep_ros import quality, reports
 from sidestep_ros.commands import Attitude, Commands
 from sidestep_ros.cycle import Cycle, Late
+from sidestep_ros.log import DecisionLog
 from sidestep_ros.markers import Painter
 from sidestep_ros.messages import COMMAND_TYPES
 from sidestep_ros.parameters import DECIDING, SCENARIO, TOPICS, Parameter, declare
@@ -48,9 +49,11 @@ class OnboardNode(Node, abc.ABC):
         self.target: tuple[float, float] | None = None
         self.world: Any = None
         self.onboard = self.make_onboard(make_onboard_settings(self.values, self.scenario))
+        about = {"shield": self.values["shield"], "source": name}
+        self._log = DecisionLog(self.values["log"], self.scenario, self.values["frame"], about)
         self._cycle = Cycle(period, grace=self.values["grace"], late_after=self.values["late_after"])
         self._robots = Robots(
-            self, self.values, self.times, self.attitude, self.complaints, self._on_complete
+            self, self.values, self.times, self.attitude, self.complaints, self._on_complete, period
         )
         self._painter = Painter(self.scenario, self.values["frame"], self.values["marker_period"])
         self._lates: list[Late] = []
@@ -114,6 +117,7 @@ class OnboardNode(Node, abc.ABC):
         """Tell the robot to stop, and give that time to be heard."""
         self._command.publish(self.commands.write(self.get_clock().now().to_msg(), 0.0, 0.0, 0.0))
         self._command.wait_for_all_acked(Duration(seconds=_STOP_SECONDS))
+        self._log.close()
 
     def _on_complete(self) -> None:
         if self.values["trigger"] == "poses" and self._cycle.is_due(self.times.of_cycle()):
@@ -144,6 +148,9 @@ class OnboardNode(Node, abc.ABC):
         # The command is out; what follows may take its time.
         self._report(decision, stamp, now)
         self._paint(decision, stamp, now)
+        complaint = self._log.add(self._decided_at, decision)
+        if complaint:
+            self.complaints.add("log", complaint)
 
     def _report(self, decision: Any, stamp: Any, now: float) -> None:
         news = (decision.level, decision.reactions)

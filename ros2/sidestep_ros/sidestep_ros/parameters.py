@@ -209,6 +209,7 @@ DECIDING = (
     Parameter(
         "diagnostics_period", 0.5, "Longest time (s) between diagnostics; 0.0: every decision.", 0.0, 60.0
     ),
+    Parameter("log", "", "New MCAP file for every decision and what it was made from; empty: none."),
     Parameter("marker_period", 0.2, "Time (s) between markers, while somebody looks; 0.0: none.", 0.0, 60.0),
 )
 """What the two nodes that decide have in common."""

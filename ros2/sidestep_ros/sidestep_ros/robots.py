@@ -12,12 +12,16 @@ from sidestep_ros.messages import POSE_TYPES, UnusableMessageError, read_pose
 from sidestep_ros.reports import Complaints
 from sidestep_ros.times import Times
 
+_OF_ONE_SWEEP = 0.75
+
 
 class Robots:
     """Subscriptions to the poses of evader, pursuers and obstacles.
 
     What the core accepts is told to `attitude` too, if it is the evader's; what cannot be used, to
-    `complaints`. `on_complete` is called when every robot has been heard of since `begin_anew`.
+    `complaints`. `on_complete` is called when every robot has been heard of since `begin_anew`, and none of
+    the poses is older than the newest by three quarters of the `period` (s) or more: with one that came a
+    little after the last decision, every set would be complete a pose too early from then on.
     """
 
     def __init__(
@@ -28,10 +32,11 @@ class Robots:
         attitude: Attitude,
         complaints: Complaints,
         on_complete: Callable[[], None],
+        period: float,
     ):
         self._node, self._times = node, times
         self._attitude, self._complaints, self._on_complete = attitude, complaints, on_complete
-        self._frame = values["frame"]
+        self._frame, self._spread = values["frame"], _OF_ONE_SWEEP * period
         self._topics = {("evader", 0): (values["evader.topic"], POSE_TYPES[values["evader.type"]])}
         for kind in ("pursuer", "obstacle"):
             for index, topic in enumerate(values[f"{kind}s.topics"]):
@@ -85,5 +90,6 @@ class Robots:
             self._attitude.see(stamp, pose.heading)
         self._stamps[kind, index] = stamp
         self._heard.add((kind, index))
-        if len(self._heard) == len(self._topics):
+        stamps = [self._stamps[robot] for robot in self._heard]
+        if len(stamps) == len(self._topics) and max(stamps) - min(stamps) < self._spread:
             self._on_complete()

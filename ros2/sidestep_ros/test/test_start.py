@@ -25,6 +25,16 @@ def test_node_with_wrong_parameters_says_all_of_them_and_ends(tmp_path, environm
     assert "Traceback" not in node.said
 
 
+def test_a_log_is_never_written_over(tmp_path, environment):
+    (tmp_path / "drive.mcap").write_bytes(b"of yesterday")
+    node = NodeProcess(
+        "shield_node", tmp_path, f"log:={tmp_path / 'drive.mcap'}", "shield:=game", environment=environment
+    )
+    assert node.wait() == 2
+    assert "drive.mcap exists already" in node.said
+    assert (tmp_path / "drive.mcap").read_bytes() == b"of yesterday"
+
+
 @pytest.fixture
 def robots(middleware):
     robots = Robots()

@@ -64,6 +64,8 @@ class Twin:
     """Also render the first episode into this MP4 file."""
     speed: float = 2.0
     """How many times faster the video runs."""
+    log: Path | None = None
+    """Also write the first episode as an MCAP log of ROS 2 messages; never over a file that exists."""
     json: Path | None = None
     """Also write the figures to this file."""
 
@@ -84,6 +86,8 @@ def run(command: Twin, console: Console) -> int:
         raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
     if not command.speed > 0.0:
         raise ValueError(f"speed = {command.speed}: it must be greater than 0")
+    if command.log is not None and command.log.exists():
+        raise ValueError(f"{command.log} exists already; give the log another name")
     scenario = load_scenario(command.scenario, **parse_overrides(command.set))
     policy: Any = command.run if command.run == "goal-seeking" else load_policy(command.run)
     options = TwinOptions(
@@ -99,7 +103,7 @@ def run(command: Twin, console: Console) -> int:
         budget = Budget(command.position_error, budget.heading_error, budget.delay, budget.tracking_error)
         settings = replace(settings, budget=budget)
     figures: list[dict[str, Any]] = []
-    first = None
+    first, interrupted = None, False
     with (
         warnings.catch_warnings(record=True) as warned,
         CountBar(console, f"{command.shield} shield, {command.pursuer}, {command.base}") as show,
@@ -107,16 +111,33 @@ def run(command: Twin, console: Console) -> int:
         warnings.simplefilter("always", BudgetWarning)
         onboard = Onboard(scenario, command.shield, policy, settings)
         onboard.warm_up()
-        for number in range(command.seeds):
-            episode = twin_episode(onboard, command.pursuer, command.seed + number, options, command.steps)
-            first = first or episode
-            figures.append(episode.to_dict())
-            show(number + 1, command.seeds)
+        try:
+            for number in range(command.seeds):
+                seed = command.seed + number
+                episode = twin_episode(onboard, command.pursuer, seed, options, command.steps)
+                first = first or episode
+                figures.append(episode.to_dict())
+                show(number + 1, command.seeds)
+        except KeyboardInterrupt:
+            interrupted = True
+            if first is None:
+                raise
     assert first is not None
     for text in dict.fromkeys(str(one.message) for one in warned):
         console.print(f"Warning: {text}.", highlight=False)
     _print(figures, console)
     write_json_file(command.json, _report(command, scenario, options, settings, figures))
+    if interrupted:
+        console.print(f"Interrupted: {len(figures)} of {command.seeds} episodes.", highlight=False)
+        return 130
+    if command.log is not None:
+        from sidestep.bridges.logs import save_log
+
+        save_log(
+            first.trajectory, scenario, command.log, about=_about(command) | {"seed": first.seed},
+            levels=first.levels, reactions=first.reactions,
+        )  # fmt: skip
+        console.print(f"Log: {command.log}", soft_wrap=True)
     if command.out is not None:
         _draw(command, scenario, policy, first, command.out, console)
     if command.video is not None:
@@ -133,13 +154,16 @@ def _draw(
 
     simulation = rollout(scenario, policy, command.shield, command.pursuer, episode.seed, steps=command.steps)
     folder.mkdir(parents=True, exist_ok=True)
-    about = {"shield": command.shield, "pursuer": command.pursuer, "source": "sidestep twin"}
-    save_trajectory(folder / "twin.npz", episode.trajectory, scenario, about)
+    save_trajectory(folder / "twin.npz", episode.trajectory, scenario, _about(command))
     words = f"physics twin, {command.base}, {command.sensors}"
     png, pdf = twin_figure(
         scenario, simulation, episode.trajectory, folder / "twin", shield=command.shield, twin_words=words
     )
     console.print(f"Figure: {png} and {pdf}", soft_wrap=True)
+
+
+def _about(command: Twin) -> dict[str, Any]:
+    return {"shield": command.shield, "pursuer": command.pursuer, "source": "sidestep twin"}
 
 
 def _report(

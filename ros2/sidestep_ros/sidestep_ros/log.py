@@ -1,0 +1,41 @@
+"""Where does a node keep what it decided?"""
+
+import os
+from typing import Any, final
+
+from sidestep_ros.parameters import ConfigurationError
+
+
+@final
+class DecisionLog:
+    """Every decision of a node and the world that it was made from, as an MCAP file; nothing without a path.
+
+    **Raises** `ConfigurationError` where the file exists, cannot be made, or the packages are missing.
+    """
+
+    def __init__(self, path: str, scenario: Any, frame: str, about: dict[str, Any]):
+        self._writer: Any = None
+        if not path:
+            return
+        from sidestep.bridges.logs import LogWriter
+
+        try:
+            self._writer = LogWriter(os.path.expanduser(path), scenario, about, frame=frame)
+        except (ValueError, OSError) as error:
+            raise ConfigurationError([f"'log': {error}"]) from error
+
+    def add(self, stamp: float, decision: Any) -> str:
+        """Write one down; says what went wrong, after which no more is written: the robot drives on."""
+        if self._writer is None:
+            return ""
+        try:
+            self._writer.onboard(stamp, decision)
+        except OSError as error:
+            self._writer = None
+            return f"cannot be written any more: {error}"
+        return ""
+
+    def close(self) -> None:
+        """Complete the file."""
+        if self._writer is not None:
+            self._writer.close()
