@@ -209,6 +209,8 @@ def test_wish_into_the_pursuer_is_not_let_through(live):
     x, y, _ = live.poses["evader"]
     live.poses["pursuer"][:2] = x + 0.28, y
     live.nominal = (SPEED, 0.0)
+    # A jump is believed after some poses; before that, commands are of the pursuer where it was.
+    heard(live, "decisions", "somewhere else")
     wait_until(lambda: live.command()[0] < 0.2 * SPEED, "a correction")
     live.nominal = (0.0, -0.02)
     live.poses["pursuer"][:2] = x + 1.2, y + 0.6
