@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from sidestep.bench.peer_task import PeerTask
 from sidestep.pursuit import make_pursuer
@@ -17,6 +18,7 @@ def our_period(scenario, world, velocity):
     return moved, events, observe(scenario, moved)
 
 
+@pytest.mark.slow
 def test_peer_moves_sees_and_scores_as_we_do(x64):
     scenario = load_scenario("paper")
     constants = scenario_to_dict(scenario)

@@ -20,6 +20,7 @@ EMPTY = load_scenario("paper", obstacle_count=0)
 UNSHIELDED = Target(EMPTY, goal_seeking, make_shield("none", EMPTY))
 
 
+@pytest.mark.slow
 def test_learning_pursuer_learns_from_every_period_that_counts():
     algorithm = TD3(hidden=(8, 8))
     lessons = Lessons(
