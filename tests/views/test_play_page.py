@@ -8,16 +8,12 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("playwright")
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import listen, make_server
 from sidestep.world import load_scenario
 
-FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 WAIT = 60_000
 BESIDE = "#shield={shield}&pursuer=nash&evader=0,0&target=0,1.4&p=-0.35,0,0&o=1.2,-1.2,0,0"
 """A link: the robot right before the pursuer, which must give way at once or be caught."""
@@ -38,17 +34,9 @@ def address():
         thread.join(60)
 
 
-@pytest.fixture(scope="module")
-def playwright():
-    with sync_playwright() as playwright:
-        yield playwright
-
-
 @pytest.fixture
-def page(playwright, need_program, address, request):
+def page(browser, address, request):
     """A page that is ready, and that has had no error by the end of the test."""
-    program = need_program("chromium", "chromium-browser", package="chromium")
-    browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
     options = {"viewport": {"width": 1280, "height": 760}, **getattr(request, "param", {})}
     context = browser.new_context(**options)
     context.grant_permissions(["clipboard-read", "clipboard-write"], origin=address)
@@ -61,7 +49,6 @@ def page(playwright, need_program, address, request):
     page.goto(address)
     ready(page)
     yield page
-    browser.close()
     assert errors == []
     assert foreign == []
 

@@ -7,14 +7,10 @@ from dataclasses import replace
 import pytest
 
 pytest.importorskip("playwright")
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
 from sidestep.views import write_report
 
-FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 WAIT = 60_000
 
 
@@ -24,17 +20,9 @@ def report(tmp_path_factory, run_of, survey_of):
     return write_report([run], tmp_path_factory.mktemp("page") / "report.html")
 
 
-@pytest.fixture(scope="module")
-def playwright():
-    with sync_playwright() as playwright:
-        yield playwright
-
-
 @pytest.fixture
-def page(playwright, need_program, report, request):
+def page(browser, report, request):
     """The report, which has had no error and has asked for nothing by the end of the test."""
-    program = need_program("chromium", "chromium-browser", package="chromium")
-    browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
     page = browser.new_context(**getattr(request, "param", {})).new_page()
     page.set_default_timeout(WAIT)
     errors, asked = [], []
@@ -43,7 +31,6 @@ def page(playwright, need_program, report, request):
     page.on("request", lambda request: asked.append(request.url))
     page.goto(report.as_uri())
     yield page
-    browser.close()
     assert errors == []
     assert [url for url in asked if not url.startswith("data:")] == [report.as_uri()]
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from sidestep.learning import Progress
+    from sidestep.world import Scenario
 
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=VALUE ...]")]
 PursuerName = Annotated[str, tyro.conf.arg(metavar="NAME")]
@@ -36,6 +37,32 @@ def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
         except json.JSONDecodeError:
             values[name] = text
     return values
+
+
+def policy_and_scenario(
+    run: str, scenario: str | None, overrides: tuple[str, ...]
+) -> tuple[Any, Scenario, dict[str, Any]]:
+    """The policy of `run` (a folder, a policy file, or goal-seeking), and as `scenario_of_run`."""
+    if run == "goal-seeking":
+        return run, *scenario_of_run(None, scenario, overrides)
+    from sidestep.learning import load_policy
+
+    return load_policy(run), *scenario_of_run(run, scenario, overrides)
+
+
+def scenario_of_run(
+    run: str | None, scenario: str | None, overrides: tuple[str, ...]
+) -> tuple[Scenario, dict[str, Any]]:
+    """The scenario to use a policy in, and what its folder says of the training: `scenario` if one is named,
+    else the folder's own, else paper."""
+    from sidestep.learning.records import open_run
+    from sidestep.world import load_scenario
+
+    changes = parse_overrides(overrides)
+    config = open_run(run) if run is not None and Path(run).is_dir() else {}
+    if scenario is None and config:
+        return load_scenario("paper", **{**config["scenario"], **changes}), config
+    return load_scenario(scenario or "paper", **changes), config
 
 
 def write_json_file(path: Path | None, data: Any) -> None:

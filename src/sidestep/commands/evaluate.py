@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import CountBar, Overrides, parse_overrides, write_json_file
+from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, write_json_file
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
@@ -51,22 +51,10 @@ class Evaluate:
 
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
-    from sidestep.learning import load_policy
-    from sidestep.learning.records import open_run
     from sidestep.trials import episode_key, rollout
     from sidestep.trials import evaluate as run_evaluation
-    from sidestep.world import load_scenario
 
-    overrides = parse_overrides(command.set)
-    policy: Any = command.run
-    config: dict[str, Any] = {}
-    if command.run != "goal-seeking":
-        policy = load_policy(command.run)
-        config = open_run(command.run) if Path(command.run).is_dir() else {}
-    if command.scenario is None and config:
-        scenario = load_scenario("paper", **{**config["scenario"], **overrides})
-    else:
-        scenario = load_scenario(command.scenario or "paper", **overrides)
+    policy, scenario, config = policy_and_scenario(command.run, command.scenario, command.set)
     if not 0 <= command.log_episode < command.episodes:
         raise ValueError(
             f"log_episode = {command.log_episode}: it must be the number of an episode, 0 to "

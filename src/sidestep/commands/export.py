@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import Overrides, parse_overrides, write_json_file
+from sidestep.commands.common import Overrides, scenario_of_run, write_json_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,21 +50,14 @@ class Export:
 def run(command: Export, console: Console) -> int:
     """Run `sidestep export`; returns the exit status."""
     from sidestep.learning import load_policy
-    from sidestep.learning.records import open_run
     from sidestep.safety import Budget, GameShield, make_shield
-    from sidestep.world import load_scenario
 
     if command.format not in ("onnx", "jax"):
         raise ValueError(f"unknown format '{command.format}'; use onnx or jax")
     if command.out.exists() and not command.overwrite:
         raise ValueError(f"{command.out} exists already; give another file, or --overwrite to replace it")
     policy = load_policy(command.run)
-    config = open_run(command.run) if Path(command.run).is_dir() else {}
-    overrides = parse_overrides(command.set)
-    if command.scenario is None and config:
-        scenario = load_scenario("paper", **{**config["scenario"], **overrides})
-    else:
-        scenario = load_scenario(command.scenario or "paper", **overrides)
+    scenario, config = scenario_of_run(command.run, command.scenario, command.set)
     name = command.shield or ("game" if command.format == "onnx" else config.get("shield", "joint"))
     if command.format == "onnx" and name != "game":
         raise ValueError(

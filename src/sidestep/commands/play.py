@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import Overrides, PursuerName, ShieldName, parse_overrides
+from sidestep.commands.common import Overrides, PursuerName, ShieldName, policy_and_scenario
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,21 +46,9 @@ class Play:
 
 def run(command: Play, console: Console) -> int:
     """Run `sidestep play` until Ctrl-C; returns the exit status."""
-    from sidestep.learning import load_policy
-    from sidestep.learning.records import open_run
     from sidestep.views.play import Hosting, Limits, serve
-    from sidestep.world import load_scenario
 
-    overrides = parse_overrides(command.set)
-    policy: Any = command.run
-    config: dict[str, Any] = {}
-    if command.run != "goal-seeking":
-        policy = load_policy(command.run)
-        config = open_run(command.run) if Path(command.run).is_dir() else {}
-    if command.scenario is None and config:
-        scenario = load_scenario("paper", **{**config["scenario"], **overrides})
-    else:
-        scenario = load_scenario(command.scenario or "paper", **overrides)
+    policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     hosting = Hosting(
         scenario,
         policy,

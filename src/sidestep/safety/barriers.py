@@ -360,9 +360,10 @@ class PursuitBarrier(Barrier):
             aside = jnp.cos(robot[2]) * wish[1] - jnp.sin(robot[2]) * wish[0]
             wanted = jnp.where(aside < 0.0, -1.0, 1.0).astype(z.dtype)
             decided = jnp.abs(aside) > _DECIDED * scenario.evader_speed
-            own = self.recall(scenario, world.evader, robot, None)
-            free = (wanted == own) | self._may_keep(scenario, game, z, wanted)
-            if self.budget is not None:
+            if self.budget is None:
+                own = self.recall(scenario, world.evader, robot, None)
+                free = (wanted == own) | self._may_keep(scenario, game, z, wanted)
+            else:
                 free = self._surely_feasible(scenario, game, z, wanted)
             return jnp.where(decided & free, wanted, kept)
 

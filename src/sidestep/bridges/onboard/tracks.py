@@ -111,8 +111,11 @@ class EvaderTrack(Track):
     def take(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
         assert self.stamp is not None
         elapsed = stamp - self.stamp
-        _, velocity = self._driven(self.stamp, stamp)
-        expected, grown = self.at(stamp), (self._drift * elapsed) ** 2 + (0.1 * self._drift) ** 2 * elapsed
+        way, velocity = self._driven(self.stamp, stamp)
+        expected, grown = (
+            self._pose + np.array([*way, 0.0]),
+            (self._drift * elapsed) ** 2 + (0.1 * self._drift) ** 2 * elapsed,
+        )
         spread = [variance + grown for variance in self._variance]
         gains = [own / (own + noise) for own, noise in zip(spread, self._noise, strict=True)]
         error = pose - expected
