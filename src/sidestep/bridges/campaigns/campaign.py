@@ -1,0 +1,215 @@
+"""How does a campaign get done? Jobs are handed out one per worker; what is there already is not run again."""
+
+from __future__ import annotations
+
+import queue
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sidestep.bridges.campaigns.cluster import LOCAL, connected
+from sidestep.bridges.campaigns.worker import run_on_worker
+from sidestep.bridges.packages import needed
+
+if TYPE_CHECKING:
+    from sidestep.trials.campaign import Campaign, Job, Task
+
+_LOOK_SECONDS = 1.0
+"""How often to look for new and lost workers while no job ends."""
+Show = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job without a result, and why."""
+
+    job: Job
+    reason: str
+
+
+@dataclass
+class CampaignOutcome:
+    """What became of a campaign's jobs.
+
+    **Attributes:** `jobs` asked for; `earlier` of them were there already; `ran` ended with a result now; `failed`
+    did not; `damaged` result files were set aside; `lost_workers` were there and then not; `stopped` is why it
+    ended before its end, None if it did not; `seconds` from the first worker to the last result.
+    """
+
+    jobs: int
+    earlier: int
+    ran: int = 0
+    failed: list[Failure] = field(default_factory=list)
+    damaged: int = 0
+    lost_workers: int = 0
+    workers: int = 0
+    stopped: str | None = None
+    seconds: float = 0.0
+
+    @property
+    def done(self) -> int:
+        """Jobs with a result."""
+        return self.earlier + self.ran
+
+    @property
+    def complete(self) -> bool:
+        """Whether every job has a result."""
+        return self.done == self.jobs
+
+
+def _quiet(done: int, jobs: int, note: str) -> None:
+    pass
+
+
+def run_campaign(
+    campaign: Campaign,
+    folder: str | Path,
+    *,
+    scheduler: str = LOCAL,
+    workers: int | None = None,
+    threads_per_worker: int | None = None,
+    progress: Show = _quiet,
+    run: Callable[[Task, Path | None], Any] | None = None,
+) -> CampaignOutcome:
+    """Run the jobs of a campaign that have no result in `folder` yet, and write `results.parquet` there.
+
+    A job whose worker dies is run again elsewhere. One under which workers die again and again is set apart and
+    run alone at the end, so that it takes no other with it. A job that raises is not run again now, but by the
+    next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one goes on.
+
+    **Arguments:** `scheduler` `local` or the address of one that runs; `workers` and `threads_per_worker` for
+    `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in place of `run_task`.
+
+    **Raises** `ValueError` when another call works on the folder, when it holds something else, when no
+    scheduler answers, and for bad options; and when the extra `cluster` is missing.
+    """
+    from sidestep.bridges.campaigns.cluster import local_size
+    from sidestep.bridges.campaigns.table import write_table
+    from sidestep.trials.campaign import Store, campaign_rows
+
+    for package in ("distributed", "pyarrow"):
+        needed(package, "cluster", "campaigns need")
+    if scheduler == LOCAL:
+        local_size(workers, threads_per_worker)
+    store = Store(folder)
+    with store.alone():
+        store.begin(campaign.name, campaign.text)
+        todo = [job for job in campaign.jobs if store.read(job.id) is None]
+        outcome = CampaignOutcome(len(campaign.jobs), len(campaign.jobs) - len(todo))
+        begun = time.monotonic()
+        try:
+            if todo:
+                with connected(scheduler, workers, threads_per_worker) as client:
+                    begun = time.monotonic()
+                    _Dispatch(client, store, outcome, progress, run).all(todo)
+        except KeyboardInterrupt:
+            outcome.stopped = "interrupted"
+        except SchedulerLostError:
+            outcome.stopped = f"the scheduler at {scheduler} is gone"
+        finally:
+            outcome.seconds = time.monotonic() - begun
+            outcome.damaged = store.damaged()
+            rows = campaign_rows(campaign.jobs, store)
+            # Also what workers put there after the command had lost them.
+            outcome.ran = len(rows) - outcome.earlier
+            write_table(store.folder / "results.parquet", rows)
+    return outcome
+
+
+class SchedulerLostError(Exception):
+    """The connection to the scheduler broke."""
+
+
+class _Dispatch:
+    """Jobs on their way to workers and back, one for each worker at a time."""
+
+    def __init__(self, client: Any, store: Any, outcome: CampaignOutcome, progress: Show, run: Any):
+        from sidestep import __version__
+
+        self.client, self.store, self.outcome, self.progress = client, store, outcome, progress
+        # What this call submits is its own: another call's job of the same name is another key.
+        self.call = uuid.uuid4().hex
+        self.about = (str(store.folder.absolute()), store.token, __version__, run)
+        self.ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.at_work: dict[Any, tuple[Job, str, bool]] = {}
+        self.suspects: deque[Job] = deque()
+        self.known: set[str] = set()
+        self.submitted = 0
+
+    def all(self, jobs: Iterable[Job]) -> None:
+        """Every job to its end. **Raises** `SchedulerLostError`."""
+        waiting = deque(jobs)
+        while waiting or self.suspects or self.at_work:
+            alive = self.workers()
+            busy = {address for _, address, _ in self.at_work.values()}
+            if waiting:
+                for address in sorted(alive - busy):
+                    if waiting:
+                        self.submit(waiting.popleft(), address)
+            elif self.suspects and not self.at_work and alive:
+                # Alone, so that whatever dies now dies of it.
+                self.submit(self.suspects.popleft(), min(alive), last_chance=True)
+            self.show(alive)
+            try:
+                self.take(self.ended.get(timeout=_LOOK_SECONDS))
+            except queue.Empty:
+                continue
+        self.show(self.known)
+
+    def workers(self) -> set[str]:
+        """Addresses of the workers that are there."""
+        if self.client.status != "running":
+            raise SchedulerLostError
+        try:
+            alive = set(self.client.nthreads())
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise SchedulerLostError from error
+        self.outcome.lost_workers += len(self.known - alive)
+        self.outcome.workers = max(self.outcome.workers, len(alive))
+        self.known = alive
+        return alive
+
+    def submit(self, job: Job, address: str, *, last_chance: bool = False) -> None:
+        self.submitted += 1
+        future = self.client.submit(
+            run_on_worker, job.task, *self.about,
+            key=("sidestep-job", job.id, self.call, self.submitted), pure=False,
+            # Rather there, since nothing runs there; where else if it dies is Dask's to say.
+            workers=[address], allow_other_workers=True,
+        )  # fmt: skip
+        self.at_work[future] = (job, address, last_chance)
+        future.add_done_callback(self.ended.put)
+
+    def take(self, future: Any) -> None:
+        """What became of a job that ended."""
+        from distributed import KilledWorker
+
+        job, _, last_chance = self.at_work.pop(future)
+        if future.status == "finished":
+            self.store.keep(future.result())
+            self.outcome.ran += 1
+            return
+        if future.status in ("cancelled", "lost"):
+            raise SchedulerLostError
+        error = future.exception()
+        if not isinstance(error, KilledWorker):
+            reason = f"{type(error).__name__}: {error}"
+        elif last_chance:
+            reason = "every worker that ran it died"
+        else:
+            self.suspects.append(job)
+            return
+        self.outcome.failed.append(Failure(job, reason))
+
+    def show(self, alive: set[str]) -> None:
+        outcome = self.outcome
+        notes = [f"{len(alive)} workers" if len(alive) != 1 else "1 worker"]
+        if outcome.lost_workers:
+            notes.append(f"{outcome.lost_workers} lost")
+        if outcome.failed:
+            notes.append(f"{len(outcome.failed)} failed")
+        self.progress(outcome.done, outcome.jobs, ", ".join(notes))

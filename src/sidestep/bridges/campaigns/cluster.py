@@ -1,0 +1,85 @@
+"""Where do the jobs run? On workers that this machine starts, or those of a scheduler that runs already."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sidestep.bridges.packages import needed
+
+LOCAL = "local"
+_DEATHS = 1
+"""Workers that may die under a job before it is set apart, to run alone at the end."""
+_CONNECT_SECONDS = 10
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:
+    """Workers, and threads for each: together as many as there are cores, unless told otherwise.
+
+    **Raises** `ValueError` for a number below 1.
+    """
+    for name, value in (("workers", workers), ("threads_per_worker", threads)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} = {value}: at least 1 is needed")
+    if workers is None:
+        return max(1, cores() // (threads or 1)), threads or 1
+    return workers, threads or max(1, cores() // workers)
+
+
+@contextmanager
+def connected(scheduler: str, workers: int | None, threads: int | None) -> Iterator[Any]:
+    """A Dask client: of workers on this machine for `local`, else of the scheduler at that address.
+
+    Local workers and their scheduler listen on 127.0.0.1 only, without a dashboard, and end with the command.
+
+    **Raises** `ValueError` when nothing answers at the address, or for options that do not go together.
+    """
+    distributed: Any = needed("distributed", "cluster", "campaigns need")
+    if scheduler == LOCAL:
+        with _local(distributed, *local_size(workers, threads)) as client:
+            yield client
+        return
+    if "://" not in scheduler:
+        raise ValueError(f"scheduler = '{scheduler}': it must be local or an address such as tcp://host:8786")
+    if workers is not None or threads is not None:
+        raise ValueError("--workers and --threads-per-worker are for --scheduler local; a cluster has its own")
+    try:
+        client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(f"no scheduler answers at {scheduler}: {error}") from None
+    # Dask tells of a lost connection in many words; the command says it in one line.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+@contextmanager
+def _local(distributed: Any, workers: int, threads: int) -> Iterator[Any]:
+    import dask.config
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": _DEATHS}),
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=threads,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            # Jobs hold little of their own: a limit would only pause workers beside a large neighbour.
+            memory_limit=0,
+            preload="sidestep.bridges.campaigns.worker",
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
