@@ -14,6 +14,8 @@ LOCAL = "local"
 _DEATHS = 1
 """Workers that may die under a job before it is set apart, to run alone at the end."""
 _CONNECT_SECONDS = 10
+_LOCAL_CONFIG = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+"""Dask's web servers have nothing to tell: nobody asks them here."""
 
 
 def cores() -> int:
@@ -68,13 +70,13 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Any]:
     import dask.config
 
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": _DEATHS}),
+        dask.config.set(_LOCAL_CONFIG | {"distributed.scheduler.allowed-failures": _DEATHS}),
         distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=threads,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             # Jobs hold little of their own: a limit would only pause workers beside a large neighbour.
             memory_limit=0,
             preload="sidestep.bridges.campaigns.worker",

@@ -49,10 +49,7 @@ def take_cores(threads: int) -> None:
 def run_on_worker(
     task: Any, folder: str, token: str, version: str, run: Callable[[Task, Path | None], Any] | None
 ) -> dict[str, Any]:
-    """The record of a job, from the folder if it is there already.
-
-    Where the worker sees the campaign's folder it puts the result there itself, so that nothing is lost with the
-    scheduler; where it does not, only the command that waits for it does.
+    """`run_once` on the cores of the Dask worker that this is called on.
 
     **Raises** what the job raises; `RuntimeError` where another version of sidestep is installed than there.
     """
@@ -64,20 +61,31 @@ def run_on_worker(
         raise RuntimeError(f"the worker has sidestep {sidestep.__version__}, the command {version}")
     with _ONE_AT_A_TIME:
         take_cores(get_worker().state.nthreads)
-        from sidestep.trials.campaign import Store, run_task
-        from sidestep.trials.campaign.jobs import record_of
+        return run_once(task, folder, token, run)
 
-        store = Store(folder)
-        seen = _token(store) == token
-        with store.lock(task.job) if seen else contextlib.nullcontext():
-            if seen and (record := store.read(task.job)) is not None:
-                return record
-            begun = time.monotonic()
-            figures = (run or run_task)(task, store.run_folder(task.job) if seen else None)
-            record = record_of(task, figures, time.monotonic() - begun)
-            if seen:
-                store.keep(record)
+
+def run_once(
+    task: Any, folder: str, token: str, run: Callable[[Task, Path | None], Any] | None
+) -> dict[str, Any]:
+    """The record of a job, from the campaign's folder if it is there already.
+
+    Where this process sees the folder it puts the result there itself, so that nothing is lost with the
+    scheduler, and waits while another one runs the same job; elsewhere the command alone keeps it.
+    """
+    from sidestep.trials.campaign import Store, run_task
+    from sidestep.trials.campaign.jobs import record_of
+
+    store = Store(folder)
+    seen = _token(store) == token
+    with store.lock(task.job) if seen else contextlib.nullcontext():
+        if seen and (record := store.read(task.job)) is not None:
             return record
+        begun = time.monotonic()
+        figures = (run or run_task)(task, store.run_folder(task.job) if seen else None)
+        record = record_of(task, figures, time.monotonic() - begun)
+        if seen:
+            store.keep(record)
+        return record
 
 
 def _token(store: Any) -> str | None:

@@ -108,7 +108,7 @@ def compare(
         for key, strata in groups.items()
     ]
     pairs = []
-    for (first, of_first), (second, of_second) in itertools.combinations(groups.items(), 2):
+    for (second, of_second), (first, of_first) in itertools.combinations(groups.items(), 2):
         common = [stratum for stratum in of_first if stratum in of_second]
         if not common:
             continue
