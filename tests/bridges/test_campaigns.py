@@ -17,9 +17,10 @@ import pytest
 
 from sidestep.bridges.campaigns import cluster as cluster_module
 from sidestep.bridges.campaigns import run_campaign, worker
+from sidestep.bridges.campaigns.campaign import _Waiting
 from sidestep.bridges.campaigns.cluster import local_size
 from sidestep.cli import main
-from sidestep.trials.campaign import Store
+from sidestep.trials.campaign import Job, Store
 
 HERE = Path(__file__).parent
 # Dask's own threads close their sockets in an order of their own.
@@ -230,6 +231,25 @@ def test_bad_addresses_and_sizes_are_named(stand_ins, tmp_path):
     ):
         with pytest.raises(ValueError, match=named):
             run_campaign(campaign, tmp_path / "out", **options)
+
+
+def test_workers_do_not_all_compile_the_same_program(stand_ins):
+    jobs = [
+        Job({"shield": shield, "seed": seed}, {"shield": shield, "seed": seed})
+        for shield in ("none", "paper", "game")
+        for seed in range(3)
+    ]
+    waiting, given = _Waiting(jobs), {"first": [], "second": []}
+    for turn in range(9):
+        worker_name = "first" if turn % 2 == 0 else "second"
+        given[worker_name].append(waiting.next_for(worker_name))
+    assert not waiting
+    assert sorted(job.id for jobs in given.values() for job in jobs) == sorted(job.id for job in jobs)
+    shields = {name: [job.labels["shield"] for job in jobs] for name, jobs in given.items()}
+    assert shields == {
+        "first": ["none", "none", "none", "game", "game"],
+        "second": ["paper", "paper", "paper", "game"],
+    }
 
 
 def test_workers_share_the_cores(monkeypatch):

@@ -120,6 +120,36 @@ def run_campaign(
     return outcome
 
 
+class _Waiting:
+    """Jobs that wait, in groups that differ in nothing but the seed and so run the same compiled programs.
+
+    A worker stays with its group while it lasts, and begins the one at which the fewest are: side by side they
+    compile different programs, where all would compile the first, then the second.
+    """
+
+    def __init__(self, jobs: Iterable[Job]):
+        self.groups: dict[str, deque[Job]] = {}
+        self.at: dict[str, str] = {}
+        for job in jobs:
+            group = repr({name: label for name, label in job.labels.items() if name != "seed"})
+            self.groups.setdefault(group, deque()).append(job)
+
+    def __bool__(self) -> bool:
+        return bool(self.groups)
+
+    def next_for(self, address: str) -> Job:
+        """The next job for this worker; there must be one."""
+        group = self.at.get(address)
+        if group not in self.groups:
+            others = [at for worker, at in self.at.items() if worker != address]
+            group = min(self.groups, key=lambda name: (others.count(name), -len(self.groups[name])))
+            self.at[address] = group
+        job = self.groups[group].popleft()
+        if not self.groups[group]:
+            del self.groups[group]
+        return job
+
+
 class SchedulerLostError(Exception):
     """The connection to the scheduler broke."""
 
@@ -142,14 +172,14 @@ class _Dispatch:
 
     def all(self, jobs: Iterable[Job]) -> None:
         """Every job to its end. **Raises** `SchedulerLostError`."""
-        waiting = deque(jobs)
+        waiting = _Waiting(jobs)
         while waiting or self.suspects or self.at_work:
             alive = self.workers()
             busy = {address for _, address, _ in self.at_work.values()}
             if waiting:
                 for address in sorted(alive - busy):
                     if waiting:
-                        self.submit(waiting.popleft(), address)
+                        self.submit(waiting.next_for(address), address)
             elif self.suspects and not self.at_work and alive:
                 # Alone, so that whatever dies now dies of it.
                 self.submit(self.suspects.popleft(), min(alive), last_chance=True)
