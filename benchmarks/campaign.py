@@ -2,9 +2,10 @@
 
     python benchmarks/campaign.py --out benchmarks/results/campaign.json
 
-runs 200 short evaluations as one campaign, by turns on one and on two local workers of one thread each; then once
-more on two, kills a worker with SIGKILL, later the command itself, in which the scheduler is, starts the command
-again, and counts results. Programs are compiled before, in a campaign of one job. Needs the extra `cluster`.
+runs 200 short evaluations as one campaign on two local workers, kills a worker with SIGKILL, later the
+command itself, in which the scheduler is, starts the command again, and counts results. Then it times the
+same campaign, by turns on one and on two workers of one thread each. Programs are compiled before, in a
+campaign of one job. Needs the extra `cluster`, and Linux.
 """
 
 import argparse
@@ -102,16 +103,13 @@ def wait_for(out: Path, count: int, child: subprocess.Popen[bytes]) -> None:
 
 def worker_processes(parent: int) -> list[int]:
     """Children of a process that Dask spawned, on Linux."""
-    children = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii").split()
-    return [
-        int(child)
-        for child in children
-        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
-    ]
+    lists = Path(f"/proc/{parent}/task").glob("*/children")
+    children = [child for one in lists for child in one.read_text(encoding="ascii").split()]
+    return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
 def drill(folder: Path, count: int) -> dict[str, Any]:
-    """A worker is killed after a quarter of the jobs, the command after half of them; then it is begun again."""
+    """A worker is killed after a quarter of the jobs, the command after half; then it is begun again."""
     (folder / "drill.toml").write_bytes((folder / "all.toml").read_bytes())
     out = folder / "drill-2"
     with subprocess.Popen(

@@ -226,7 +226,8 @@ def test_bad_input_is_named_and_nothing_is_written(arguments, named, tmp_path, c
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["train"], ["evaluate"], ["reproduce"], ["certify"], ["falsify"], ["report"], ["campaign"]]
+    "command",
+    [[], ["train"], ["evaluate"], ["reproduce"], ["certify"], ["falsify"], ["report"], ["campaign"]],
 )
 def test_help_of_every_command(command, capsys):
     with pytest.raises(SystemExit) as stop:

@@ -10,7 +10,19 @@ import tyro
 from tyro.conf import subcommand
 
 from sidestep._compiled import keep_compiled_programs
-from sidestep.commands import bench, campaign, certify, evaluate, export, falsify, play, report, reproduce, train, twin
+from sidestep.commands import (
+    bench,
+    campaign,
+    certify,
+    evaluate,
+    export,
+    falsify,
+    play,
+    report,
+    reproduce,
+    train,
+    twin,
+)
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,

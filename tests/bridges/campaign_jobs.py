@@ -10,7 +10,7 @@ from sidestep.trials.campaign import Campaign, Job
 
 
 def make_campaign(log: Path, jobs: int, **trouble) -> Campaign:
-    """`jobs` stand-ins; `trouble` maps numbers of jobs by what they do: `dies=[1], dies_once=[2], raises=[3]`."""
+    """`jobs` stand-ins; `trouble` numbers them by what they do: `dies=[1], dies_once=[2], raises=[3]`."""
 
     def what(number):
         return next((word for word, numbers in trouble.items() if number in numbers), "works")
@@ -48,6 +48,4 @@ if __name__ == "__main__":
     from sidestep.bridges.campaigns import run_campaign
 
     folder, log, jobs = sys.argv[1:]
-    run_campaign(
-        make_campaign(Path(log), int(jobs), lasts=range(int(jobs))), folder, workers=1, run=stand_in
-    )
+    run_campaign(make_campaign(Path(log), int(jobs), lasts=range(int(jobs))), folder, workers=1, run=stand_in)

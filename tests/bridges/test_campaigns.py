@@ -1,4 +1,4 @@
-"""Hazards of campaigns: workers and schedulers that die, jobs that run twice or never, results lost or doubled."""
+"""Hazards of campaigns: workers and schedulers that die, jobs run twice or never, results lost or doubled."""
 
 import contextlib
 import importlib
@@ -48,7 +48,7 @@ def cluster_of_threads(workers):
 @pytest.fixture(scope="module")
 def threads():
     with cluster_of_threads(2) as local:
-        yield local.scheduler_address
+        yield local
 
 
 def records_in(folder):
@@ -109,9 +109,7 @@ def test_after_the_command_and_its_scheduler_are_killed_it_goes_on_and_runs_noth
             assert begun.count(job.labels["seed"]) == 1
     # What was at work at that moment, one job for one worker, is all that was begun again.
     assert 16 <= len(begun) <= 17
-    assert {
-        name: (out / "results" / f"{name}.json").stat().st_mtime_ns for name in done
-    } == first
+    assert {name: (out / "results" / f"{name}.json").stat().st_mtime_ns for name in done} == first
 
 
 def test_lost_scheduler_is_said_and_the_same_call_goes_on(stand_ins, threads, tmp_path):
@@ -126,7 +124,11 @@ def test_lost_scheduler_is_said_and_the_same_call_goes_on(stand_ins, threads, tm
 
     with contextlib.closing(local):
         outcome = run_campaign(
-            campaign, out, scheduler=local.scheduler_address, run=stand_ins.stand_in, progress=close_after_three
+            campaign,
+            out,
+            scheduler=local.scheduler_address,
+            run=stand_ins.stand_in,
+            progress=close_after_three,
         )
         closing.join()
     assert "is gone" in outcome.stopped
@@ -145,7 +147,7 @@ def test_longer_campaign_runs_only_what_is_new(stand_ins, threads, tmp_path):
     torn = sorted((out / "results").glob("*.json"))[0]
     torn.write_bytes(torn.read_bytes()[:-20])
     outcome = run_campaign(
-        stand_ins.make_campaign(log, 5), out, scheduler=threads, run=stand_ins.stand_in
+        stand_ins.make_campaign(log, 5), out, scheduler=threads.scheduler_address, run=stand_ins.stand_in
     )
     assert (outcome.earlier, outcome.ran, outcome.damaged) == (2, 3, 1)
     assert len(stand_ins.runs(log)) == 6
@@ -186,7 +188,9 @@ def test_worker_taken_for_dead_is_waited_for_and_its_result_is_the_one(stand_ins
         return {"by": "slow"}
 
     first = threading.Thread(target=lambda: records.update(a=worker.run_once(*arguments, slow)))
-    second = threading.Thread(target=lambda: records.update(b=worker.run_once(*arguments, stand_ins.stand_in)))
+    second = threading.Thread(
+        target=lambda: records.update(b=worker.run_once(*arguments, stand_ins.stand_in))
+    )
     first.start()
     assert begun.wait(10)
     second.start()
@@ -226,6 +230,9 @@ def test_bad_addresses_and_sizes_are_named(stand_ins, tmp_path):
     for options, named in (
         ({"scheduler": "nowhere"}, "local or an address"),
         ({"scheduler": "tcp://127.0.0.1:1", "workers": 2}, "--scheduler local"),
+        ({"scheduler": "tcp://127.0.0.1:1"}, "no scheduler answers at tcp://127.0.0.1:1"),
+        ({"scheduler": "tcp://nowhere"}, "no scheduler answers at tcp://nowhere"),
+        ({"scheduler": "tls://127.0.0.1:1"}, "needs certificates"),
         ({"workers": 0}, "workers = 0"),
         ({"threads_per_worker": -1}, "threads_per_worker = -1"),
     ):

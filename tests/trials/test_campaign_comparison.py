@@ -1,4 +1,4 @@
-"""Hazards of comparisons: strata mixed, the sign of better turned round, an interval where nothing is known."""
+"""Hazards of comparisons: strata mixed, the sign of better turned round, claims beyond what is known."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Hazards of campaign files: a job asked for twice, a job taken for another, a typing error found after a night."""
+"""Hazards of campaign files: a job asked for twice or taken for another, an error found after a night."""
 
 import dataclasses
 from pathlib import Path
@@ -119,7 +119,9 @@ def test_missing_file_is_named(tmp_path):
 
 
 def test_one_scenario_under_two_names_is_refused(load):
-    text = '[grid]\nscenario = ["a", "b"]\n[scenarios.a]\nobstacle_count = 0\n[scenarios.b]\nobstacle_count = 0'
+    text = (
+        '[grid]\nscenario = ["a", "b"]\n[scenarios.a]\nobstacle_count = 0\n[scenarios.b]\nobstacle_count = 0'
+    )
     with pytest.raises(CampaignError, match="the same job twice"):
         load(text)
 

@@ -24,13 +24,12 @@ _FAILURES_SHOWN = 5
 
 @dataclass(frozen=True)
 class Campaign:
-    """Run a grid of trainings or evaluations over many cores or machines; the same command goes on with it."""
+    """Run a grid of trainings or evaluations over cores or machines; the same command goes on with it."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
     """Campaign file: what to run, over which seeds, scenarios, shields and pursuers."""
     out: Path | None = None
-    """Folder for the results, one that holds this campaign already or a new one; by default the file's name under
-    runs/."""
+    """Folder for the results, a new one or this campaign's; by default runs/ and the file's name."""
     scheduler: Annotated[str, tyro.conf.arg(metavar="local|tcp://HOST:PORT")] = "local"
     """Workers on this machine, or those of a Dask scheduler that runs already."""
     workers: int | None = None
@@ -107,8 +106,8 @@ def _say(
         console.print(text, highlight=False, soft_wrap=True)
 
     say(
-        f"{outcome.done} of {outcome.jobs} jobs have a result: {outcome.ran} ran now, {outcome.earlier} before. "
-        f"Table: {folder / 'results.parquet'}"
+        f"{outcome.done} of {outcome.jobs} jobs have a result: "
+        f"{outcome.ran} ran now, {outcome.earlier} before. Table: {folder / 'results.parquet'}"
     )
     if outcome.damaged:
         say(f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
@@ -135,7 +134,9 @@ def comparison_tables(comparisons: Sequence[Comparison]) -> list[Any]:
 
     tables = []
     for comparison in comparisons:
-        title = comparison.figure.replace("_", " ") + (" (less is better)" if comparison.lower_is_better else "")
+        title = comparison.figure.replace("_", " ") + (
+            " (less is better)" if comparison.lower_is_better else ""
+        )
         table = Table("group", "runs", "interquartile mean", "95 % interval", title=title)
         for group in comparison.groups:
             estimate, low, high = group.interquartile_mean

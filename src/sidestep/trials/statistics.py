@@ -103,7 +103,7 @@ def probability_of_improvement(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """How probable it is that a value of `first` is greater than one of `second`, with its bootstrap interval.
+    """How probable it is that a value of `first` is greater than one of `second`, with a bootstrap interval.
 
     The mean over strata of P(X > Y) + P(X = Y)/2, which is Mann and Whitney's U over the number of pairs; the
     values of both are resampled within each stratum (Agarwal et al., NeurIPS 2021). Over one half, `first` is

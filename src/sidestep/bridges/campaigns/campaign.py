@@ -1,4 +1,4 @@
-"""How does a campaign get done? Jobs are handed out one per worker; what is there already is not run again."""
+"""How does a campaign get done? Workers are handed one job each; what is there already is not run again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sidestep.bridges.campaigns.cluster import LOCAL, connected
+from sidestep.bridges.campaigns.cluster import LOCAL, connected, local_size, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
 from sidestep.bridges.packages import needed
 
@@ -35,9 +35,10 @@ class Failure:
 class CampaignOutcome:
     """What became of a campaign's jobs.
 
-    **Attributes:** `jobs` asked for; `earlier` of them were there already; `ran` ended with a result now; `failed`
-    did not; `damaged` result files were set aside; `lost_workers` were there and then not; `stopped` is why it
-    ended before its end, None if it did not; `seconds` from the first worker to the last result.
+    **Attributes:** `jobs` asked for; `earlier` of them were there already; `ran` ended with a result now;
+    `failed` did not; `damaged` result files were set aside since the folder was begun; `lost_workers` were
+    there and then not; `stopped` is why it ended before its end, None if it did not; `seconds` from the first
+    worker to the last result.
     """
 
     jobs: int
@@ -69,7 +70,7 @@ def run_campaign(
     campaign: Campaign,
     folder: str | Path,
     *,
-    scheduler: str = LOCAL,
+    scheduler: Any = LOCAL,
     workers: int | None = None,
     threads_per_worker: int | None = None,
     progress: Show = _quiet,
@@ -77,17 +78,18 @@ def run_campaign(
 ) -> CampaignOutcome:
     """Run the jobs of a campaign that have no result in `folder` yet, and write `results.parquet` there.
 
-    A job whose worker dies is run again elsewhere. One under which workers die again and again is set apart and
-    run alone at the end, so that it takes no other with it. A job that raises is not run again now, but by the
-    next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one goes on.
+    A job whose worker dies is run again elsewhere. One under which workers die again and again is set apart
+    and run alone at the end, so that it takes no other with it. A job that raises is not run again now, but
+    by the next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one
+    goes on.
 
-    **Arguments:** `scheduler` `local` or the address of one that runs; `workers` and `threads_per_worker` for
-    `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in place of `run_task`.
+    **Arguments:** `scheduler` `local`, the address of one that runs, or a cluster object of Dask's; `workers`
+    and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
+    place of `run_task`.
 
     **Raises** `ValueError` when another call works on the folder, when it holds something else, when no
     scheduler answers, and for bad options; and when the extra `cluster` is missing.
     """
-    from sidestep.bridges.campaigns.cluster import local_size
     from sidestep.bridges.campaigns.table import write_table
     from sidestep.trials.campaign import Store, campaign_rows
 
@@ -109,7 +111,7 @@ def run_campaign(
         except KeyboardInterrupt:
             outcome.stopped = "interrupted"
         except SchedulerLostError:
-            outcome.stopped = f"the scheduler at {scheduler} is gone"
+            outcome.stopped = f"the scheduler at {name_of(scheduler)} is gone"
         finally:
             outcome.seconds = time.monotonic() - begun
             outcome.damaged = store.damaged()
@@ -123,8 +125,8 @@ def run_campaign(
 class _Waiting:
     """Jobs that wait, in groups that differ in nothing but the seed and so run the same compiled programs.
 
-    A worker stays with its group while it lasts, and begins the one at which the fewest are: side by side they
-    compile different programs, where all would compile the first, then the second.
+    A worker stays with its group while it lasts, and begins the one at which the fewest are: side by side
+    they compile different programs, where all would compile the first, then the second.
     """
 
     def __init__(self, jobs: Iterable[Job]):

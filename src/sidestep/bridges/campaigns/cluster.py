@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -36,9 +37,17 @@ def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:
     return workers, threads or max(1, cores() // workers)
 
 
+def name_of(scheduler: Any) -> str:
+    """The address of a scheduler or cluster, for messages."""
+    return (
+        scheduler if isinstance(scheduler, str) else str(getattr(scheduler, "scheduler_address", scheduler))
+    )
+
+
 @contextmanager
-def connected(scheduler: str, workers: int | None, threads: int | None) -> Iterator[Any]:
-    """A Dask client: of workers on this machine for `local`, else of the scheduler at that address.
+def connected(scheduler: Any, workers: int | None, threads: int | None) -> Iterator[Any]:
+    """A Dask client: of workers on this machine for `local`, else of the scheduler at that address, or of a
+    cluster that one of Dask's deployers has started.
 
     Local workers and their scheduler listen on 127.0.0.1 only, without a dashboard, and end with the command.
 
@@ -49,20 +58,43 @@ def connected(scheduler: str, workers: int | None, threads: int | None) -> Itera
         with _local(distributed, *local_size(workers, threads)) as client:
             yield client
         return
-    if "://" not in scheduler:
+    if isinstance(scheduler, str) and "://" not in scheduler:
         raise ValueError(f"scheduler = '{scheduler}': it must be local or an address such as tcp://host:8786")
     if workers is not None or threads is not None:
-        raise ValueError("--workers and --threads-per-worker are for --scheduler local; a cluster has its own")
+        raise ValueError(
+            "--workers and --threads-per-worker are for --scheduler local; a cluster has its own"
+        )
+    if isinstance(scheduler, str):
+        _check_reachable(scheduler)
     try:
         client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(f"no scheduler answers at {scheduler}: {error}") from None
+        raise ValueError(f"no scheduler answers at {name_of(scheduler)}: {error}") from None
     # Dask tells of a lost connection in many words; the command says it in one line.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         yield client
     finally:
         client.close()
+
+
+def _check_reachable(address: str) -> None:
+    """What Dask would find out too, after long, and tell at length."""
+    from distributed.comm.addressing import parse_host_port
+    from distributed.security import Security
+
+    scheme, _, place = address.partition("://")
+    if scheme == "tls" and Security().get_connection_args("client")["ssl_context"] is None:
+        raise ValueError(
+            f"{address} needs certificates: name them in Dask's configuration, distributed.comm.tls.ca-file "
+            "and distributed.comm.tls.client.cert and .key"
+        )
+    if scheme in ("tcp", "tls"):
+        try:
+            host, port = parse_host_port(place)
+            socket.create_connection((host, port), timeout=_CONNECT_SECONDS).close()
+        except (OSError, ValueError) as error:
+            raise ValueError(f"no scheduler answers at {address}: {error}") from None
 
 
 @contextmanager

@@ -25,7 +25,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def dask_setup(worker: Any) -> None:
-    """Called by Dask in a new local worker: Ctrl-C reaches every process of a terminal, and is the command's."""
+    """Called in a new local worker: Ctrl-C reaches every process of a terminal, but is the command's."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

@@ -1,4 +1,4 @@
-"""How groups of jobs compare: interquartile means and probabilities of improvement, with what they leave open."""
+"""How groups of jobs compare: interquartile means and probabilities of improvement, with intervals."""
 
 from __future__ import annotations
 
@@ -91,7 +91,9 @@ def compare(
         group = groups.setdefault(tuple(row.get(axis) for axis in by), {})
         group.setdefault(tuple(row.get(axis) for axis in strata_by), []).append(float(value))
     if not groups:
-        known = sorted({name for row in rows for name, value in row.items() if isinstance(value, (int, float))})
+        known = sorted(
+            {name for row in rows for name, value in row.items() if isinstance(value, (int, float))}
+        )
         raise ValueError(f"no result has a figure '{figure}'; known: {', '.join(known) or 'none'}")
 
     def labels(key: _Labels) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def run_task(task: Task, folder: Path | None) -> dict[str, Any]:
     **Arguments:** `folder` for what a training leaves; it goes on where it stopped if it was begun there.
     Without one nothing but the figures is kept.
 
-    **Raises** what the job itself raises; `ValueError` when the policy's file is not the one that was planned.
+    **Raises** what the job itself raises; `ValueError` when the policy's file has changed meanwhile.
     """
     return _RUN[task.settings["kind"]](task, folder)
 

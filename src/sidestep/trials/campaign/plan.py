@@ -105,12 +105,9 @@ class _Reader:
         for name in table:
             if name not in names:
                 near = difflib.get_close_matches(name, names, n=1)
-                hint = f"; did you mean '{near[0]}'?" if near else ""
+                hint = f"; did you mean '{near[0]}'?" if near else "."
                 self.fail(
-                    f"{where}.{name}" if where else name,
-                    f"is unknown{hint} Known here: {', '.join(names)}."
-                    if hint
-                    else f"is unknown. Known here: {', '.join(names)}.",
+                    f"{where}.{name}" if where else name, f"is unknown{hint} Known here: {', '.join(names)}."
                 )
 
     def table(self, name: str) -> dict[str, Any]:
@@ -162,17 +159,17 @@ class _Reader:
         axes: dict[str, list[Any]] = {}
         for name in (axis for axis in AXES if axis in _KIND_AXES[kind]):
             value = grid.get(name, _DEFAULT_AXES[name])
-            values = self.seeds(value) if name == "seed" else value if isinstance(value, list) else [value]
+            values: list[Any] = value if isinstance(value, list) else [value]
+            if name == "seed":
+                values = self.seeds(value)
             if not values:
                 self.fail(f"grid.{name}", "is empty: a grid without a value has no jobs")
             for label in values:
                 if name != "seed" and not isinstance(label, str):
                     self.fail(f"grid.{name}", f"holds {label!r}: names are needed, as text")
-                if values.count(label) > 1 and name != "seed":
-                    self.fail(f"grid.{name}", f"holds {label!r} twice; each value may stand there once")
-            if name == "seed" and len(set(values)) < len(values):
-                twice = next(seed for seed in values if values.count(seed) > 1)
-                self.fail("grid.seed", f"holds {twice} twice; each value may stand there once")
+            if len(set(values)) < len(values):
+                twice = next(label for label in values if values.count(label) > 1)
+                self.fail(f"grid.{name}", f"holds {twice!r} twice; each value may stand there once")
             axes[name] = values
         count = 1
         for values in axes.values():
@@ -276,7 +273,9 @@ class _Reader:
                 try:
                     as_policy(load_policy(file), load_scenario("paper", **fields))
                 except ValueError as error:
-                    self.fail("grid.policy", f"names '{policy}', which does not fit scenario '{label}': {error}")
+                    self.fail(
+                        "grid.policy", f"names '{policy}', which does not fit scenario '{label}': {error}"
+                    )
 
     def compare(self, kind: str) -> CompareSettings | None:
         table = self.table("compare")

@@ -25,8 +25,8 @@ class Store:
     """The results of a campaign in its folder.
 
     `campaign.json` (which folder this is), `campaign.toml` (what was asked for), `results/JOB.json` (one job
-    each), `runs/JOB/` (what trainings leave), `locks/`. A result is first written whole beside its place, then
-    put there by a hard link, which fails if another is there: the first complete result stays.
+    each), `runs/JOB/` (what trainings leave), `locks/`. A result is first written whole beside its place,
+    then put there by a hard link, which fails if another is there: the first complete result stays.
     """
 
     def __init__(self, folder: str | Path):
@@ -88,7 +88,7 @@ class Store:
             raise ValueError(f"{self.folder} holds other files and no campaign; choose another --out")
 
     def lock(self, job: str) -> FileLock:
-        """Held by the process that runs the job, so that a worker taken for dead does not run it beside another."""
+        """Held by the process that runs the job: a worker taken for dead does not run it beside another."""
         return FileLock(self.folder / "locks" / f"{job}.lock", poll_interval=0.2)
 
     def run_folder(self, job: str) -> Path:
