@@ -21,6 +21,7 @@ from sidestep.learning import train
 from sidestep.safety.catalogue import SHIELDS
 from sidestep.trials import load_survey
 from sidestep.trials.campaign import load_campaign, run_task
+from sidestep.trials.campaign.jobs import figure_names, flat
 from sidestep.trials.reproduction import reproduce
 
 LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
@@ -97,6 +98,14 @@ def test_untrained_policy_is_evaluated_under_the_joint_shield_by_default(tmp_pat
     figures = json.loads(path.read_text())
     assert figures["shield"] == "joint"
     assert figures["timed_out"] == figures["episodes"] == 2
+    # A job of a campaign is the command that it stands for.
+    (tmp_path / "grid.toml").write_text(
+        '[grid]\nscenario = "calm"\n[scenarios.calm]\nepisode_steps = 30\nobstacle_count = 0\n'
+        "[settings]\nepisodes = 2\n"
+    )
+    (job,) = load_campaign(tmp_path / "grid.toml").jobs
+    of_job = run_task(job.task, None)
+    assert of_job == {name: figures[name] for name in of_job}
 
 
 def test_resumed_run_is_the_longer_run(run, tmp_path):
@@ -157,6 +166,7 @@ def test_training_of_a_campaign_is_the_run_and_goes_on_where_it_was_left(run, tm
     shutil.copytree(out, folder)
     (folder / "policy.npz").unlink()
     figures = run_task(job.task, folder)
+    assert set(figure_names("train")) == set(flat(figures))
     assert figures["training_episodes"] == 2
     assert figures["training_env_steps"] == json.loads((out / "summary.json").read_text())["env_steps"]
     assert figures["episodes"] == 4

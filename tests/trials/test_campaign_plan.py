@@ -100,10 +100,14 @@ def test_learners_are_an_axis_of_trainings(load):
         ('[grid]\nscenario = "mine"\n[scenarios.mine]\nevader_sped = 1.0', "did you mean 'evader_speed'?"),
         ('kind = "train"\n[grid]\nlearner = "quick"', "no table [learners.quick]"),
         ('kind = "train"\n[grid]\nlearner = "a"\n[learners.a]\ndiscount = 2', "discount"),
+        ('[compare]\nby = ["shield"]\nfigures = ["reached_rat"]', "did you mean 'reached_rate'?"),
         ('[compare]\nby = ["seed"]\nfigures = ["x"]', "'compare.by' holds 'seed'"),
         ('[compare]\nby = ["shield"]', "'compare.figures' is needed"),
         ('[compare]\nby = "shield"\nfigures = ["x"]', "list of names"),
-        ('[compare]\nby = ["shield"]\nfigures = ["x"]\nlower_is_better = ["y"]', "compare.figures does not"),
+        (
+            '[compare]\nby = ["shield"]\nfigures = ["reached"]\nlower_is_better = ["y"]',
+            "compare.figures does not",
+        ),
     ],
 )
 def test_bad_file_is_refused_with_its_name_the_key_and_what_is_allowed(load, tmp_path, text, named):

@@ -60,9 +60,11 @@ def run(command: Campaign, console: Console) -> int:
             threads_per_worker=command.threads_per_worker, progress=show,
         )  # fmt: skip
     rows = campaign_rows(plan.jobs, Store(folder))
-    comparisons = _comparisons(plan, rows)
+    comparisons, without = _comparisons(plan, rows)
     for table in comparison_tables(comparisons):
         console.print(table)
+    for words in without:
+        console.print(f"Not compared: {words}", highlight=False, soft_wrap=True)
     _say(command, folder, outcome, rows, console)
     write_json_file(command.json, _report(plan, outcome, comparisons))
     if outcome.stopped == "interrupted":
@@ -70,17 +72,19 @@ def run(command: Campaign, console: Console) -> int:
     return 0 if outcome.complete else 1
 
 
-def _comparisons(plan: Plan, rows: list[dict[str, Any]]) -> list[Comparison]:
-    """What the file asks to compare, as far as there are results."""
+def _comparisons(plan: Plan, rows: list[dict[str, Any]]) -> tuple[list[Comparison], list[str]]:
+    """What the file asks to compare, as far as there are results, and why the rest is not."""
     from sidestep.trials.campaign import compare
 
-    asked = plan.compare
-    if asked is None or not rows:
-        return []
-    return [
-        compare(rows, asked.by, figure, lower_is_better=figure in asked.lower_is_better)
-        for figure in asked.figures
-    ]
+    asked, found, without = plan.compare, [], []
+    for figure in asked.figures if asked is not None and rows else ():
+        assert asked is not None
+        try:
+            found.append(compare(rows, asked.by, figure, lower_is_better=figure in asked.lower_is_better))
+        except ValueError as error:
+            # A time to reach where nobody did, for example.
+            without.append(str(error))
+    return found, without
 
 
 def _report(plan: Plan, outcome: CampaignOutcome, comparisons: Sequence[Comparison]) -> dict[str, Any]:

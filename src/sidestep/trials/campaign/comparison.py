@@ -91,10 +91,7 @@ def compare(
         group = groups.setdefault(tuple(row.get(axis) for axis in by), {})
         group.setdefault(tuple(row.get(axis) for axis in strata_by), []).append(float(value))
     if not groups:
-        known = sorted(
-            {name for row in rows for name, value in row.items() if isinstance(value, (int, float))}
-        )
-        raise ValueError(f"no result has a figure '{figure}'; known: {', '.join(known) or 'none'}")
+        raise ValueError(f"no result has a value of '{figure}'")
 
     def labels(key: _Labels) -> dict[str, Any]:
         return dict(zip(by, key, strict=True))

@@ -14,7 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sidestep.learning.records import json_safe
+import numpy as np
+
+from sidestep.learning.records import json_safe, summarise
 
 KINDS = ("evaluate", "train")
 AXES = ("scenario", "shield", "pursuer", "policy", "learner", "seed")
@@ -78,6 +80,29 @@ def versions() -> dict[str, str]:
             continue
     # A source folder on the path has no metadata of its own.
     return found | {"sidestep": sidestep.__version__}
+
+
+def flat(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """A table within figures as one figure per entry, `NAME_ENTRY`."""
+    found: dict[str, Any] = {}
+    for name, value in figures.items():
+        if isinstance(value, Mapping):
+            found |= {f"{name}_{key}": item for key, item in flat(value).items()}
+        else:
+            found[name] = value
+    return found
+
+
+def figure_names(kind: str) -> list[str]:
+    """What a job of this kind comes to, by name, before any has run."""
+    from sidestep.trials.evaluation import Evaluation
+
+    whole, real = np.zeros(1, np.int32), np.zeros(1)
+    counts = Evaluation(whole, real, whole + 1, real, real, real, whole, whole, whole, real, real)
+    names = list(flat(counts.to_dict()))
+    if kind == "train":
+        names += [f"training_{name}" for name in summarise([], wall_seconds=0.0)]
+    return names
 
 
 def run_task(task: Task, folder: Path | None) -> dict[str, Any]:

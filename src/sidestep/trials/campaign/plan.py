@@ -14,7 +14,7 @@ from sidestep.learning import load_policy, make_options, options_to_dict
 from sidestep.learning.records import json_safe
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield
-from sidestep.trials.campaign.jobs import AXES, KINDS, Job, digest_of_file
+from sidestep.trials.campaign.jobs import AXES, KINDS, Job, digest_of_file, figure_names
 from sidestep.trials.policies import GOAL_SEEKING
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
@@ -292,6 +292,8 @@ class _Reader:
         for name in table["by"]:
             if name not in allowed:
                 self.fail("compare.by", f"holds '{name}': it must be one of {', '.join(allowed)}")
+        for name in table["figures"]:
+            self.known("compare.figures", {name: None}, figure_names(kind))
         for name in table.get("lower_is_better", []):
             if name not in table["figures"]:
                 self.fail("compare.lower_is_better", f"holds '{name}', which compare.figures does not")

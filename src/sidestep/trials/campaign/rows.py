@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
-from sidestep.trials.campaign.jobs import Job
+from sidestep.trials.campaign.jobs import Job, flat
 from sidestep.trials.campaign.store import Store
 
 
@@ -22,20 +22,10 @@ def campaign_rows(jobs: Iterable[Job], store: Store) -> list[dict[str, Any]]:
             continue
         row: dict[str, Any] = {"job": job.id, **job.labels}
         # A figure never takes the place of a label.
-        row |= {name: value for name, value in _flat(record["figures"]).items() if name not in row}
+        row |= {name: value for name, value in flat(record["figures"]).items() if name not in row}
         row |= {name: record[name] for name in ("seconds", "ended", "host", "process")}
         row |= {f"version_{name}": value for name, value in record["versions"].items()}
         folder = store.run_folder(job.id)
         row["run"] = str(folder.relative_to(store.folder)) if folder.is_dir() else None
         rows.append(row)
     return rows
-
-
-def _flat(figures: Mapping[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in figures.items():
-        if isinstance(value, Mapping):
-            flat |= {f"{name}_{key}": item for key, item in _flat(value).items()}
-        else:
-            flat[name] = value
-    return flat
