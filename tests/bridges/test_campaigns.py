@@ -15,6 +15,7 @@ import distributed
 import pyarrow.parquet
 import pytest
 
+from sidestep.bridges.campaigns import campaign as campaign_module
 from sidestep.bridges.campaigns import cluster as cluster_module
 from sidestep.bridges.campaigns import run_campaign, worker
 from sidestep.bridges.campaigns.campaign import _Waiting
@@ -72,16 +73,17 @@ def test_killed_worker_costs_no_result_and_no_job_a_second_result(stand_ins, tmp
 
 
 def test_job_that_kills_every_worker_fails_alone(stand_ins, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_module, "_DEATHS", 0)
+    monkeypatch.setattr(campaign_module, "_MOST_DEATHS", 2)
     log, out = tmp_path / "log", tmp_path / "out"
     campaign = stand_ins.make_campaign(log, 8, dies=[2], raises=[5])
     outcome = run_campaign(campaign, out, workers=1, run=stand_ins.stand_in)
     reasons = {failure.job.labels["seed"]: failure.reason for failure in outcome.failed}
     assert set(reasons) == {2, 5}
-    assert "died" in reasons[2]
+    assert reasons[2] == "2 workers died while they ran it"
     assert reasons[5] == "ArithmeticError: two and two"
     assert outcome.done == 6
     assert outcome.lost_workers >= 1
+    assert stand_ins.runs(log).count(2) == 2
     assert stand_ins.runs(log)[-1] == 2
     assert stand_ins.runs(log).count(5) == 1
 

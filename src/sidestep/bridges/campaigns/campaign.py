@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import time
 import uuid
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _LOOK_SECONDS = 1.0
 """How often to look for new and lost workers while no job ends."""
+_MOST_DEATHS = 3
+"""Workers that may die under one job."""
 Show = Callable[[int, int, str], None]
 
 
@@ -78,10 +80,9 @@ def run_campaign(
 ) -> CampaignOutcome:
     """Run the jobs of a campaign that have no result in `folder` yet, and write `results.parquet` there.
 
-    A job whose worker dies is run again elsewhere. One under which workers die again and again is set apart
-    and run alone at the end, so that it takes no other with it. A job that raises is not run again now, but
-    by the next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one
-    goes on.
+    A job whose worker dies is run again, on another worker and after the others of its kind; one under which
+    three have died has failed, and takes no other with it. A job that raises is not run again now, but by the
+    next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one goes on.
 
     **Arguments:** `scheduler` `local`, the address of one that runs, or a cluster object of Dask's; `workers`
     and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
@@ -133,8 +134,12 @@ class _Waiting:
         self.groups: dict[str, deque[Job]] = {}
         self.at: dict[str, str] = {}
         for job in jobs:
-            group = repr({name: label for name, label in job.labels.items() if name != "seed"})
-            self.groups.setdefault(group, deque()).append(job)
+            self.put(job)
+
+    def put(self, job: Job) -> None:
+        """Behind the others of its group."""
+        group = repr({name: label for name, label in job.labels.items() if name != "seed"})
+        self.groups.setdefault(group, deque()).append(job)
 
     def __bool__(self) -> bool:
         return bool(self.groups)
@@ -157,7 +162,11 @@ class SchedulerLostError(Exception):
 
 
 class _Dispatch:
-    """Jobs on their way to workers and back, one for each worker at a time."""
+    """Jobs on their way to workers and back, one for each worker at a time, so that one death is one job's.
+
+    A job is for its worker alone. Dask may choose another, but a task that merely prefers a worker, and finds
+    none alive when that one dies, is never given to those that come later.
+    """
 
     def __init__(self, client: Any, store: Any, outcome: CampaignOutcome, progress: Show, run: Any):
         from sidestep import __version__
@@ -167,24 +176,24 @@ class _Dispatch:
         self.call = uuid.uuid4().hex
         self.about = (str(store.folder.absolute()), store.token, __version__, run)
         self.ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.at_work: dict[Any, tuple[Job, str, bool]] = {}
-        self.suspects: deque[Job] = deque()
+        self.at_work: dict[Any, tuple[Job, str]] = {}
+        self.waiting = _Waiting([])
+        self.deaths: Counter[str] = Counter()
+        self.done: set[str] = set()
         self.known: set[str] = set()
         self.submitted = 0
 
     def all(self, jobs: Iterable[Job]) -> None:
         """Every job to its end. **Raises** `SchedulerLostError`."""
-        waiting = _Waiting(jobs)
-        while waiting or self.suspects or self.at_work:
+        self.waiting = _Waiting(jobs)
+        while self.waiting or self.at_work:
             alive = self.workers()
-            busy = {address for _, address, _ in self.at_work.values()}
-            if waiting:
-                for address in sorted(alive - busy):
-                    if waiting:
-                        self.submit(waiting.next_for(address), address)
-            elif self.suspects and not self.at_work and alive:
-                # Alone, so that whatever dies now dies of it.
-                self.submit(self.suspects.popleft(), min(alive), last_chance=True)
+            for future, (job, address) in list(self.at_work.items()):
+                if address not in alive:
+                    self.died(future, job)
+            for address in sorted(alive - {address for _, address in self.at_work.values()}):
+                if self.waiting:
+                    self.submit(self.waiting.next_for(address), address)
             self.show(alive)
             try:
                 self.take(self.ended.get(timeout=_LOOK_SECONDS))
@@ -205,37 +214,47 @@ class _Dispatch:
         self.known = alive
         return alive
 
-    def submit(self, job: Job, address: str, *, last_chance: bool = False) -> None:
+    def submit(self, job: Job, address: str) -> None:
         self.submitted += 1
         future = self.client.submit(
             run_on_worker, job.task, *self.about,
-            key=("sidestep-job", job.id, self.call, self.submitted), pure=False,
-            # Rather there, since nothing runs there; where else if it dies is Dask's to say.
-            workers=[address], allow_other_workers=True,
+            key=("sidestep-job", job.id, self.call, self.submitted), pure=False, workers=[address],
         )  # fmt: skip
-        self.at_work[future] = (job, address, last_chance)
+        self.at_work[future] = (job, address)
         future.add_done_callback(self.ended.put)
+
+    def died(self, future: Any, job: Job) -> None:
+        """The worker of a job is gone: another one's turn, unless too many are."""
+        del self.at_work[future]
+        future.cancel()
+        self.deaths[job.id] += 1
+        if self.deaths[job.id] < _MOST_DEATHS:
+            self.waiting.put(job)
+        else:
+            self.outcome.failed.append(Failure(job, f"{_MOST_DEATHS} workers died while they ran it"))
 
     def take(self, future: Any) -> None:
         """What became of a job that ended."""
         from distributed import KilledWorker
 
-        job, _, last_chance = self.at_work.pop(future)
-        if future.status == "finished":
-            self.store.keep(future.result())
-            self.outcome.ran += 1
+        if future not in self.at_work:
+            # Its worker was taken for dead; what it finished all the same is in the folder.
             return
+        job, _ = self.at_work[future]
         if future.status in ("cancelled", "lost"):
             raise SchedulerLostError
-        error = future.exception()
-        if not isinstance(error, KilledWorker):
-            reason = f"{type(error).__name__}: {error}"
-        elif last_chance:
-            reason = "every worker that ran it died"
-        else:
-            self.suspects.append(job)
+        if future.status == "finished":
+            del self.at_work[future]
+            self.store.keep(future.result())
+            self.done.add(job.id)
+            self.outcome.ran = len(self.done)
             return
-        self.outcome.failed.append(Failure(job, reason))
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            self.died(future, job)
+            return
+        del self.at_work[future]
+        self.outcome.failed.append(Failure(job, f"{type(error).__name__}: {error}"))
 
     def show(self, alive: set[str]) -> None:
         outcome = self.outcome

@@ -12,8 +12,6 @@ from typing import Any
 from sidestep.bridges.packages import needed
 
 LOCAL = "local"
-_DEATHS = 1
-"""Workers that may die under a job before it is set apart, to run alone at the end."""
 _CONNECT_SECONDS = 10
 _LOCAL_CONFIG = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask's web servers have nothing to tell: nobody asks them here."""
@@ -102,7 +100,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Any]:
     import dask.config
 
     with (
-        dask.config.set(_LOCAL_CONFIG | {"distributed.scheduler.allowed-failures": _DEATHS}),
+        dask.config.set(_LOCAL_CONFIG),
         distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=threads,
