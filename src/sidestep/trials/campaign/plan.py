@@ -221,7 +221,7 @@ class _Reader:
         return choices
 
     def scenario(self, label: str) -> dict[str, Any]:
-        """All fields, so that the job says by itself what it is; the name decides nothing."""
+        """All fields that are set, so that the job says by itself what it is; the name decides nothing."""
         described = self.table("scenarios")
         if label in described:
             if not isinstance(described[label], dict):
@@ -231,8 +231,7 @@ class _Reader:
         else:
             scenario = load_scenario(self.named_file(label))
         fields = json_safe(scenario_to_dict(scenario))
-        fields.pop("name")
-        return fields
+        return {name: value for name, value in fields.items() if value is not None and name != "name"}
 
     def named_file(self, name: str) -> str:
         """`name`, or the file that it names, seen from the campaign file's folder."""
