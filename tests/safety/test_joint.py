@@ -14,6 +14,8 @@ from sidestep.world import World, load_scenario
 
 # Of the first 300 random starts from key 7, some in which `game` collides while heading for the target.
 LOST_BY_GAME = (224, 242)
+# Of the first 20 random starts from key 7 with two pursuers, those in which `game` is captured.
+LOST_BETWEEN_TWO = (2, 3, 4, 5, 6, 7, 9, 13)
 
 
 def _starts(scenario, numbers):
@@ -57,6 +59,17 @@ def test_where_the_rows_alone_collide_the_look_ahead_does_not():
     assert not captured.any()
     assert not collided.any()
     assert reached.all()
+
+
+@pytest.mark.slow
+def test_two_pursuers_close_in_on_the_rows_and_not_on_the_look_ahead():
+    """No obstacle: what each pursuer's rows leave free, the other's may close."""
+    scenario = load_scenario("paper", pursuer_count=2, obstacle_count=0)
+    worlds, nash = _starts(scenario, LOST_BETWEEN_TWO), make_pursuer("nash")
+    captured, _, _ = _chase(scenario, make_shield("game", scenario), nash, worlds, 1200)
+    assert captured.all(), "without captures to prevent this test says nothing"
+    captured, _, _ = _chase(scenario, make_shield("joint", scenario), nash, worlds, 1200)
+    assert not captured.any()
 
 
 def test_an_imagined_chase_is_the_chase_that_follows():
