@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, fold, length, norm, real, stack
+from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, apart, fold, length, norm, real, stack
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
 from sidestep.world.robots import (
@@ -177,15 +177,12 @@ class Scenario(eqx.Module):
             jnp.reshape(wheel_speeds, shape), self.pursuer_speed
         )
 
-        def approach(pose: Array, wheel: Array) -> Lanes:
-            return closest_approach_driving(
-                world.evader, velocity, pose, wheel, self.pursuer_half_axle, period
-            )
-
         def pass_by(obstacle: Array) -> Lanes:
             return closest_approach_straight(world.evader - obstacle[:2], velocity - obstacle[2:], period)
 
-        to_pursuers = jax.vmap(approach)(world.pursuers, wheels)
+        # Every event asks for it, and in lanes XLA would compute it anew for each of them.
+        given = (self, world, velocity, wheels)
+        to_pursuers = apart(_approaches, *given) if world.lanes else _approaches(*given)
         to_obstacles = jax.vmap(pass_by)(world.obstacles)
         to_target = closest_approach_straight(world.evader - world.target, velocity, period)
         pursuer_clearance = fold(jnp.minimum, to_pursuers, jnp.inf) - self.capture_distance
@@ -250,3 +247,16 @@ class Scenario(eqx.Module):
         x, y = jnp.where(moving, limited[0] / safe, 1.0), jnp.where(moving, limited[1] / safe, 0.0)
         scale = self.evader_speed / length(x, y)
         return stack(x * scale, y * scale)
+
+
+def _approaches(
+    scenario: Scenario, world: World, velocity: Float[Array, "2 *lanes"], wheels: Float[Array, "m 2 *lanes"]
+) -> Float[Array, "m *lanes"]:
+    """The smallest distance (m) to each pursuer within a control period."""
+
+    def approach(pose: Array, wheel: Array) -> Lanes:
+        return closest_approach_driving(
+            world.evader, velocity, pose, wheel, scenario.pursuer_half_axle, scenario.control_period
+        )
+
+    return jax.vmap(approach)(world.pursuers, wheels)
