@@ -49,7 +49,11 @@ def make_task(
             raise ValueError(f"fields ({names}) go with a scenario's name or file, not with a Scenario")
     else:
         scenario = load_scenario(scenario, **fields)
-    if isinstance(decision_steps, bool) or not isinstance(decision_steps, (int, np.integer)) or decision_steps < 1:
+    if (
+        isinstance(decision_steps, bool)
+        or not isinstance(decision_steps, (int, np.integer))
+        or decision_steps < 1
+    ):
         raise ValueError(f"decision_steps = {decision_steps!r}: it must be a whole number of at least 1")
     if not np.isfinite(reward_scale):
         raise ValueError(f"reward_scale = {reward_scale!r}: it must be a finite number")
