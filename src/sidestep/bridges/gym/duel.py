@@ -252,6 +252,9 @@ class DuelEnv(pettingzoo.ParallelEnv):
             self._picture = None
 
 
+ID = "sidestep/Duel-v0"
+
+
 def parallel_env(**arguments: Any) -> DuelEnv:
     """A `DuelEnv`, by the name that PettingZoo's modules give it."""
     return DuelEnv(**arguments)
@@ -263,3 +266,8 @@ def env(**arguments: Any) -> Any:
     from pettingzoo.utils.conversions import parallel_to_aec
 
     return wrappers.OrderEnforcingWrapper(parallel_to_aec(DuelEnv(**arguments)))
+
+
+if ID not in pettingzoo.parallel_registry:
+    pettingzoo.register("parallel", ID, entry_point=f"{__name__}:parallel_env")
+    pettingzoo.register("aec", ID, entry_point=f"{__name__}:env")

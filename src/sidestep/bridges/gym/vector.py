@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from jaxtyping import Float
 
 from sidestep.bridges.gym import fleet as fleets
 from sidestep.bridges.gym.calls import flat, packed, seed_words, unpacked
@@ -205,7 +206,7 @@ class PursuedVectorEnv(VectorEnv):
         self._drawn = self._numbers + AHEAD
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        fleet, mode = self._now(), self.autoreset_mode
+        mode = self.autoreset_mode
         if mode is AutoresetMode.DISABLED:
             if np.any(self._ended):
                 raise gymnasium.error.ResetNeeded(
@@ -213,9 +214,7 @@ class PursuedVectorEnv(VectorEnv):
                 )
         else:
             self._draw_ahead()
-        actions = checked_action(actions, (self.num_envs, 2))
-        program = flat(_STEP[mode.value], self._structure)
-        made = program([*self._task, *fleet, *self._spares], actions)
+        made = self.program(checked_action(actions, (self.num_envs, 2)))
         self._fleet, observation, final, floats, whole = made
         reward, info = unpacked(floats, whole)
         truncated = info["timed_out"]
@@ -233,6 +232,11 @@ class PursuedVectorEnv(VectorEnv):
         if mode is not AutoresetMode.DISABLED:
             self._numbers = self._numbers + begun
         return np.array(observation), reward, terminated, truncated, info
+
+    def program(self, actions: Float[np.ndarray, "worlds 2"]) -> tuple[Any, ...]:
+        """What `step` computes, as arrays of the device, without taking the step."""
+        leaves = [*self._task, *self._now(), *self._spares]
+        return flat(_STEP[self.autoreset_mode.value], self._structure)(leaves, actions)
 
     def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
         """Vector infos: beside each entry, which worlds have it; entries of the others are zero."""
