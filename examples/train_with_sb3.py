@@ -1,4 +1,4 @@
-"""Stable-Baselines3 learns to reach the target behind our shield: TD3 or SAC, then 200 episodes without noise.
+"""Stable-Baselines3 learns to reach the target behind our shield: TD3 or SAC, then episodes without noise.
 
     pip install torch==2.13.0 && pip install stable-baselines3 'sidestep[gym]'
     python examples/train_with_sb3.py --algorithm sac
@@ -32,6 +32,7 @@ class Watched(gymnasium.Wrapper):
 
 
 def main():
+    """Train, then count how episodes end."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -50,7 +51,8 @@ def main():
     }  # fmt: skip
     if options.algorithm == "td3":
         noise = NormalActionNoise(np.zeros(2), np.full(2, 0.1))
-        model = TD3(
+        layers = {"net_arch": [256, 256]}
+        model = TD3("MlpPolicy", Monitor(env), action_noise=noise, policy_kwargs=layers, **common)
             "MlpPolicy", Monitor(env), action_noise=noise, policy_kwargs={"net_arch": [256, 256]}, **common
         )
     else:

@@ -336,7 +336,7 @@ def test_safety_gymnasium_gets_its_cost_third():
     observation, _, cost, terminated, truncated, info = env.step(AHEAD)
     assert observation in env.observation_space
     assert (cost, terminated, truncated) == (info["cost"], False, False)
+    foreign = SafetyGymnasiumWrapper(Foreign(SCENARIO))
+    foreign.reset()
     with pytest.raises(KeyError, match="cost"):
-        foreign = SafetyGymnasiumWrapper(Foreign(SCENARIO))
-        foreign.reset()
         foreign.step(AHEAD)

@@ -1,7 +1,8 @@
 """Gymnasium environments and wrappers, and a PettingZoo environment in which the pursuer learns too.
 
-Importing this registers `sidestep/Pursued-v0`; `gymnasium.make("sidestep.bridges.gym:sidestep/Pursued-v0")` does
-so by itself. Needs the extra `gym`.
+Importing this registers `sidestep/Pursued-v0` with Gymnasium, and
+`gymnasium.make("sidestep.bridges.gym:sidestep/Pursued-v0")` imports it. The PettingZoo environment is in
+`sidestep.bridges.gym.duel`. All need the extra `gym`.
 """
 
 from sidestep.bridges.packages import needed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import gymnasium
@@ -37,6 +37,9 @@ class _Told(eqx.Module):
 
     def steer_all(self, scenario: Scenario, world: World) -> Float[Array, "m 2"]:
         return self.wheel_speeds
+
+    def __call__(self, scenario: Scenario, world: World, key: Any) -> Float[Array, "2"]:
+        return self.wheel_speeds[0]
 
 
 def pursuer_observation(scenario: Scenario, world: World) -> Float[Array, "size"]:
@@ -106,8 +109,8 @@ class DuelEnv(pettingzoo.ParallelEnv):
     """The evader and its pursuers, all of them learners, acting at once.
 
     **Agents:** `evader`, as in `PursuedEnv`, behind `shield` (or `"none"`); and `pursuer`, or `pursuer_0`,
-    `pursuer_1`, ... if there are several, whose action in [-1, 1]^2 is the left and right wheel's rim speed over
-    `pursuer_speed`, and who see what `pursuer_observation` says.
+    `pursuer_1`, ... if there are several. Their action in [-1, 1]^2 is the left and right wheel's rim speed
+    over `pursuer_speed`; they see what `pursuer_observation` says.
 
     **Rewards** add up to zero: the evader gets the scenario's, less `capture_penalty` (the scenario's
     `reach_reward` unless given) for a capture or collision, times `reward_scale`; each of the m pursuers the
@@ -116,7 +119,8 @@ class DuelEnv(pettingzoo.ParallelEnv):
     Arguments and `info` are otherwise those of `PursuedEnv`; an episode ends for all agents at once.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    # Each has its own, with its own pictures per second.
+    metadata: dict[str, Any] = {
         "name": "sidestep_duel_v0",
         "render_modes": ["human", "rgb_array"],
         "render_fps": 20,

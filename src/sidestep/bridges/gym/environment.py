@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import gymnasium
 import jax
@@ -45,14 +45,16 @@ class PursuedEnv(gymnasium.Env):
     - `terminated` is true when captured, collided or at the target, `truncated` when the scenario's
       `episode_steps` control periods are over.
     - The reward is the scenario's, summed over the step's control periods, times `reward_scale`.
-    - `info` has `cost` (1.0 for a capture or collision), the flags `captured`, `collided`, `reached`,
-      `timed_out`, the shield's worst `status` of the step, its mean `intervention` (m/s), the action `proposed`
-      and the one `executed` on average, the least `pursuer_clearance` and `obstacle_clearance` (m), `periods`.
-    - `reset(seed=s)` begins episode 0 of `sidestep.evaluate(..., key=s)`, each further `reset()` the next one.
+    - `info` has `cost` (1.0 for a capture or collision), the flags `captured`, `collided`, `reached` and
+      `timed_out`, the shield's worst `status` of the step and its mean `intervention` (m/s), the action
+      `proposed` and the mean one `executed`, the least `pursuer_clearance` and `obstacle_clearance` (m), and
+      the control `periods` lived through.
+    - `reset(seed=s)` begins episode 0 of `sidestep.evaluate(..., key=s)`, each further `reset()` the next.
       `reset(options={"world": ...})` starts in a given `World`, or in a mapping of its parts.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}
+    # Each has its own, with its own pictures per second.
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}
 
     def __init__(
         self,

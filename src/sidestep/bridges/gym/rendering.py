@@ -28,9 +28,9 @@ _VISIBLE = 1e-6
 
 
 def check_render_mode(mode: str | None) -> str | None:
-    """The mode itself. **Raises** `ValueError` for one that does not exist, or whose package is missing."""
+    """The mode itself. **Raises** `ValueError` for an unknown one, or when its package is missing."""
     if mode is not None and mode not in MODES:
-        raise ValueError(f"render_mode = {mode!r}: it must be one of {', '.join(map(repr, MODES))}, or None")
+        raise ValueError(f"render_mode = {mode!r}: it must be {' or '.join(map(repr, MODES))}, or None")
     if mode == "human":
         needed("pygame", "gym", "the render_mode 'human' needs")
     return mode

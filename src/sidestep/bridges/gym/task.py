@@ -37,9 +37,9 @@ def make_task(
 ) -> Task:
     """A task from what the environments take.
 
-    **Arguments:** `scenario` a preset, a file or a `Scenario`; `shield` a name or a `Shield`; `pursuer` a name,
-    a `Pursuer` or a callable `(scenario, world, key) -> wheel speeds`; `fields` of the scenario by name, unless
-    it is a `Scenario` already.
+    **Arguments:** `scenario` a preset, a file or a `Scenario`; `shield` a name or a `Shield`; `pursuer` a
+    name, a `Pursuer` or a callable `(scenario, world, key) -> wheel speeds`; `fields` of the scenario by
+    name, unless it is a `Scenario` already.
 
     **Raises** `ValueError` (`ScenarioError` for fields) naming what is wrong and what is allowed.
     """

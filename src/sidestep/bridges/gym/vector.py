@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import gymnasium
 import jax
@@ -26,31 +26,31 @@ _DRAWN_AT_ONCE = 256
 
 def _launch(task: Task, words: Any, number: Any) -> tuple[list[Any], list[Any], Any]:
     fleet = fleets.launch(task, words, number)
-    return (*_leaves(fleet, fleets.no_spares(fleet)), fleets.seen(task, fleet.episode))
+    return _leaves(fleet), _leaves(fleets.no_spares(fleet)), fleets.seen(task, fleet.episode)
 
 
 def _place(task: Task, fleet: Fleet, world: World) -> tuple[list[Any], Any]:
     fleet = fleets.place(task, fleet, world)
-    return *_leaves(fleet), fleets.seen(task, fleet.episode)
+    return _leaves(fleet), fleets.seen(task, fleet.episode)
 
 
 def _follow(task: Task, fleet: Fleet, spares: Episode, where: Any) -> tuple[list[Any], Any]:
     fleet = fleets.follow(fleet, spares, where)
-    return *_leaves(fleet), fleets.seen(task, fleet.episode)
+    return _leaves(fleet), fleets.seen(task, fleet.episode)
 
 
 def _draw(task: Task, fleet: Fleet, spares: Episode, lanes: Any, numbers: Any) -> list[Any]:
-    return _leaves(fleets.draw(task, fleet, spares, lanes, numbers))[0]
+    return _leaves(fleets.draw(task, fleet, spares, lanes, numbers))
 
 
-def _leaves(*trees: Any) -> tuple[list[Any], ...]:
-    return tuple(map(jax.tree.leaves, trees))
+def _leaves(tree: Any) -> list[Any]:
+    return jax.tree.leaves(tree)
 
 
 def _stepper(mode: str) -> Any:
     def step(task: Task, fleet: Fleet, spares: Episode, actions: Any) -> tuple[Any, ...]:
         fleet, made = fleets.step(task, mode, fleet, spares, actions)
-        return *_leaves(fleet), made.observation, made.final, *packed(made.decision)
+        return _leaves(fleet), made.observation, made.final, *packed(made.decision)
 
     return step
 
@@ -71,7 +71,8 @@ class PursuedVectorEnv(VectorEnv):
     episodes as a `PursuedEnv` with that seed, to rounding. Arrays in `info` are read-only views.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    # Each has its own, with its own pictures per second.
+    metadata: dict[str, Any] = {
         "render_modes": ["rgb_array"],
         "render_fps": 20,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -147,8 +148,8 @@ class PursuedVectorEnv(VectorEnv):
             world = given_world(self.scenario, options["world"], (self.num_envs,))
             leaves, structure = jax.tree.flatten((self.task, shapes, world))
             place = flat(_place, structure)
-            given = leaves[len(self._task) + len(self._fleet) :]
-            self._fleet, observation = place([*self._task, *self._fleet, *given])
+            given = leaves[len(self._task) + len(self._now()) :]
+            self._fleet, observation = place([*self._task, *self._now(), *given])
         self._ended = np.zeros(self.num_envs, bool)
         return np.array(observation), {}
 

@@ -16,10 +16,11 @@ _PARTS = ("evader", "pursuers", "obstacles", "target")
 
 def given_world(scenario: Scenario, given: Any, lanes: tuple[int, ...] = ()) -> World:
     """The world of `options={"world": ...}`: a `World`, or a mapping of `evader` (2,), `pursuers` (m, 3),
-    `obstacles` (k, 4) and `target` (2,), each with an axis of worlds in front if there are several. Time is 0.
+    `obstacles` (k, 4) and `target` (2,), each with an axis of worlds in front if there are several. It starts
+    at time 0.
 
-    **Returns** it in lanes if there are several. **Raises** `ValueError` naming the part that is missing, has
-    the wrong shape or is not finite.
+    **Returns** it in lanes if there are several. **Raises** `ValueError` naming the part that is missing,
+    has the wrong shape or is not finite.
     """
     if not isinstance(given, (World, Mapping)):
         raise ValueError(f"options['world'] must be a World or a mapping, not a {type(given).__name__}")
@@ -38,7 +39,7 @@ def given_world(scenario: Scenario, given: Any, lanes: tuple[int, ...] = ()) -> 
         wanted = (*lanes, *shapes[name])
         if parts[name].shape != wanted or not np.all(np.isfinite(parts[name])):
             raise ValueError(
-                f"options['world']: {name!r} must be finite numbers of shape {wanted}, not {parts[name].shape}"
+                f"options['world']: {name!r} must be {wanted} finite numbers, not {parts[name].shape}"
             )
     if not lanes:
         return World(**parts)

@@ -33,11 +33,11 @@ class ShieldWrapper(gymnasium.Wrapper):
     - `shield` a `sidestep.Shield`, as `make_shield(name, scenario)` gives it
     - `world_of(env) -> World` reads where everybody is (SI units) from the wrapped environment
     - `velocity_of(action, world) -> (2,)` m/s in world axes that an action asks for; by default the action
-    - `action_of(velocity, world)` the way back; by default the velocity. An action that the shield leaves as it
-      is goes through untouched.
+    - `action_of(velocity, world)` the way back; by default the velocity. An action that the shield leaves as
+      it is goes through untouched.
 
-    `info` gains `proposed` and `executed` (actions), `status` (see `sidestep.safety.Status`) and `intervention`
-    (m/s). Learners that store `proposed`, their own action, learn what a correction leads to.
+    `info` gains `proposed` and `executed` (actions), `status` (see `sidestep.safety.Status`) and
+    `intervention` (m/s). Learners that store `proposed`, their own action, learn what a correction leads to.
     """
 
     def __init__(
