@@ -117,9 +117,7 @@ def main() -> None:
             if name != "plain":
                 case |= compiled_share(environments[name], options.worlds)
             cases.append(case)
-            spent = (
-                f"{case['program_us']:.0f} of {case['step_us']:.0f} us compiled" if name != "plain" else ""
-            )
+            spent = "{program_us:.0f} of {step_us:.0f} us compiled".format(**case) if name != "plain" else ""
             print(
                 f"hold {hold:2}, {case['side']:19}: {middle[name]:12,.0f} steps/s, {case['ratio']:6.1f} times "
                 f"the plain one ({case['ratio_least']:.1f} to {case['ratio_most']:.1f}) {spent}",

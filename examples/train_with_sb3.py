@@ -46,15 +46,12 @@ def main():
     # An action is held for ten control periods, and the reward for reaching becomes 10: what our learner has.
     task = {"shield": options.shield, "decision_steps": 10, "reward_scale": 0.01}
     env = Watched(gymnasium.make("sidestep.bridges.gym:sidestep/Pursued-v0", **task))
-    common = {
-        "batch_size": 256, "learning_starts": min(500, options.steps // 2), "seed": options.seed, "device": "cpu",
-    }  # fmt: skip
+    begin = min(500, options.steps // 2)
+    common = {"batch_size": 256, "learning_starts": begin, "seed": options.seed, "device": "cpu"}
     if options.algorithm == "td3":
         noise = NormalActionNoise(np.zeros(2), np.full(2, 0.1))
         layers = {"net_arch": [256, 256]}
         model = TD3("MlpPolicy", Monitor(env), action_noise=noise, policy_kwargs=layers, **common)
-            "MlpPolicy", Monitor(env), action_noise=noise, policy_kwargs={"net_arch": [256, 256]}, **common
-        )
     else:
         model = SAC("MlpPolicy", Monitor(env), **common)
     model.learn(options.steps)

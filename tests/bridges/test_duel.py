@@ -102,12 +102,14 @@ def test_a_pursuer_sees_the_same_wherever_the_scene_lies():
 
 
 def test_several_pursuers_share_what_the_evader_loses_and_each_has_its_own_wheels():
-    env = duel.parallel_env(**{**TASK, "scenario": load_scenario("paper", pursuer_count=2)})
+    env = duel.parallel_env(
+        **{**TASK, "decision_steps": 1, "scenario": load_scenario("paper", pursuer_count=2)}
+    )
     env.reset(seed=1)
     before = np.asarray(env.world.pursuers)
     _, gains, *_ = env.step({"evader": STOP, "pursuer_0": FULL, "pursuer_1": STOP})
     assert gains["pursuer_0"] == gains["pursuer_1"] == pytest.approx(-gains["evader"] / 2.0)
     went = np.linalg.norm(np.asarray(env.world.pursuers)[:, :2] - before[:, :2], axis=-1)
-    np.testing.assert_allclose(went, (0.2 * 0.05 * 3, 0.0), atol=1e-5)
+    np.testing.assert_allclose(went, (0.2 * 0.05, 0.0), atol=1e-5)
     with pytest.raises(ValueError, match="pursuer_1"):
         env.step({"evader": STOP, "pursuer_0": FULL})

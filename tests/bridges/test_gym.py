@@ -172,7 +172,7 @@ def test_a_capture_costs_and_ends_while_a_time_limit_only_cuts():
 
 
 def test_what_was_executed_is_told_in_the_units_of_what_was_proposed():
-    env = chasing(shield="game")
+    env = chasing(shield="paper")
     env.reset(seed=0, options=at())
     *_, free = env.step(0.5 * AHEAD)
     np.testing.assert_allclose(free["executed"], free["proposed"], atol=1e-5)

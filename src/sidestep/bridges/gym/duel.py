@@ -120,7 +120,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
     """
 
     # Each has its own, with its own pictures per second.
-    metadata: dict[str, Any] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "sidestep_duel_v0",
         "render_modes": ["human", "rgb_array"],
         "render_fps": 20,

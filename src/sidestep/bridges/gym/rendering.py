@@ -38,7 +38,7 @@ def check_render_mode(mode: str | None) -> str | None:
 
 @final
 class Picture:
-    """The scene of an episode that is followed step by step: robots, distances, barrier, ways, corrections."""
+    """The scene of an episode followed step by step: robots, distances, barrier, ways, corrections."""
 
     def __init__(self, scenario: Scenario, shield: Any):
         self._scenario = scenario

@@ -72,7 +72,7 @@ class PursuedVectorEnv(VectorEnv):
     """
 
     # Each has its own, with its own pictures per second.
-    metadata: dict[str, Any] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["rgb_array"],
         "render_fps": 20,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
