@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from jaxtyping import Array, Float
 
-from sidestep.bridges.gym.calls import FLAGS, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Picture, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
@@ -155,11 +155,10 @@ class DuelEnv(pettingzoo.ParallelEnv):
             **{agent: _pursuer_space(self.scenario) for agent in self.pursuers},
         }
         self.action_spaces = {agent: action_space() for agent in self.possible_agents}
-        self._leaves = jax.tree.leaves(self.task)
+        self._task, self._layout = bundled(self.task), bundle_of(self.task)
         shapes = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
         example = jax.eval_shape(begin, self.task, *shapes)
         self._inner = jax.tree.structure(example)
-        self._whole = jax.tree.structure((self.task, example))
         self._words, self._number = np.zeros(2, np.uint32), -1
         self._episode: list[Any] | None = None
         self._picture: Picture | None = None
@@ -190,12 +189,12 @@ class DuelEnv(pettingzoo.ParallelEnv):
             seed = seeding.np_random()[1] if seed is None else seed
             self._words, self._number = seed_words([seed])[:, 0], -1
         self._number += 1
-        trees: tuple[Any, ...] = (self.task,)
+        number = np.asarray(self._number, np.int32)
         if options and "world" in options:
-            trees = (self.task, given_world(self.scenario, options["world"]))
-        leaves, structure = jax.tree.flatten(trees)
-        program = flat(_begin if len(trees) == 1 else _begin_in, structure)
-        made = program(leaves, self._words, np.asarray(self._number, np.int32))
+            leaves, structure = jax.tree.flatten(given_world(self.scenario, options["world"]))
+            made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
+        else:
+            made = flat(_begin, self._layout)((self._task,), self._words, number)
         self._episode, observation, views = made
         self.agents = list(self.possible_agents)
         self._show(begun=True)
@@ -211,9 +210,9 @@ class DuelEnv(pettingzoo.ParallelEnv):
         if missing:
             raise ValueError(f"no action for {', '.join(missing)}")
         wheels = np.stack([checked_action(actions[agent], (2,)) for agent in self.pursuers])
-        program = flat(_step, self._whole)
         assert self._episode is not None
-        made = program(self._leaves + self._episode, checked_action(actions[EVADER], (2,)), wheels)
+        program, told = flat(_step, self._layout, self._inner), checked_action(actions[EVADER], (2,))
+        made = program((self._task, self._episode), told, wheels)
         self._episode, observation, views, floats, whole = made
         reward, info = unpacked(floats, whole)
         info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}

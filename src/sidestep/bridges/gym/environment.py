@@ -9,7 +9,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from sidestep.bridges.gym.calls import FLAGS, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Picture, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
@@ -54,7 +54,7 @@ class PursuedEnv(gymnasium.Env):
     """
 
     # Each has its own, with its own pictures per second.
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -80,17 +80,16 @@ class PursuedEnv(gymnasium.Env):
         self._compile()
 
     def _compile(self) -> None:
-        self._leaves = jax.tree.leaves(self.task)
+        self._task, self._layout = bundled(self.task), bundle_of(self.task)
         shapes = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
         example = jax.eval_shape(begin, self.task, *shapes)
-        self._whole = jax.tree.structure((self.task, example))
         self._inner = jax.tree.structure(example)
 
     def __getstate__(self) -> dict[str, Any]:
         return {
             name: value
             for name, value in self.__dict__.items()
-            if name not in ("_leaves", "_whole", "_inner", "_picture")
+            if name not in ("_task", "_layout", "_inner", "_picture")
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -127,11 +126,10 @@ class PursuedEnv(gymnasium.Env):
         number = np.asarray(self._number, np.int32)
         if options and "world" in options:
             world = given_world(self.scenario, options["world"])
-            leaves, structure = jax.tree.flatten((self.task, world))
-            made = flat(_begin_in, structure)(leaves, self._words, number)
+            leaves, structure = jax.tree.flatten(world)
+            made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
         else:
-            leaves, structure = jax.tree.flatten((self.task,))
-            made = flat(_begin, structure)(leaves, self._words, number)
+            made = flat(_begin, self._layout)((self._task,), self._words, number)
         self._episode, observation = made
         self._over = False
         self._show(begun=True)
@@ -140,8 +138,8 @@ class PursuedEnv(gymnasium.Env):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode is over, or has not begun: call reset()")
-        program = flat(_step, self._whole)
-        made = program(self._leaves + self._now(), checked_action(action, (2,)))
+        program = flat(_step, self._layout, self._inner)
+        made = program((self._task, self._now()), checked_action(action, (2,)))
         self._episode, observation, floats, whole = made
         reward, info = unpacked(floats, whole)
         # Plain numbers, as Gymnasium's own environments give them; arrays of their own.

@@ -52,18 +52,27 @@ def place(task: Task, fleet: Fleet, world: World) -> Fleet:
     return Fleet(episode, jnp.zeros_like(fleet.ended))
 
 
-def no_spares(fleet: Fleet) -> Episode:
-    """Room for the next episodes of each lane, `AHEAD` in front of all other axes."""
-    return jax.tree.map(lambda leaf: jnp.zeros((AHEAD, *leaf.shape), leaf.dtype), fleet.episode)
+class Spares(eqx.Module):
+    """Worlds in which the next episodes of each lane start, and the shield's memories there: `AHEAD` of them
+    in front of all other axes, that of episode n at n modulo `AHEAD`."""
+
+    world: Any
+    memory: Any
+
+
+def no_spares(fleet: Fleet) -> Spares:
+    """Room for them."""
+    starts = Spares(fleet.episode.world, fleet.episode.memory)
+    return jax.tree.map(lambda leaf: jnp.zeros((AHEAD, *leaf.shape), leaf.dtype), starts)
 
 
 def draw(
     task: Task,
     fleet: Fleet,
-    spares: Episode,
+    spares: Spares,
     lanes: Int[AnyArray, "several"],
     numbers: Int[AnyArray, "several"],
-) -> Episode:
+) -> Spares:
     """The spares with the starts of these episodes of these lanes among them; lanes that do not exist draw
     nothing."""
     lanes, numbers = jnp.asarray(lanes), jnp.asarray(numbers)
@@ -73,21 +82,29 @@ def draw(
     def put(old: Any, new: Any) -> Any:
         return old.at[numbers % AHEAD, ..., lanes].set(jnp.moveaxis(new, -1, 0), mode="drop")
 
-    return jax.tree.map(put, spares, drawn)
+    return jax.tree.map(put, spares, Spares(drawn.world, drawn.memory))
 
 
-def follow(fleet: Fleet, spares: Episode, where: Bool[AnyArray, "lanes"]) -> Fleet:
+def follow(fleet: Fleet, spares: Spares, where: Bool[AnyArray, "lanes"]) -> Fleet:
     """The next episode, which must be among the spares, in these lanes."""
-    where = jnp.asarray(where)
-    slot = (fleet.episode.number + 1) % AHEAD
+    where, now = jnp.asarray(where), fleet.episode
+    slot = (now.number + 1) % AHEAD
     spare = jax.tree.map(lambda leaf: leaf[0], spares)
     for index in range(1, AHEAD):
         spare = select(slot == index, jax.tree.map(lambda leaf: leaf[index], spares), spare)  # noqa: B023
-    return Fleet(select(where, spare, fleet.episode), fleet.ended & ~where)
+    world, memory = select(where, (spare.world, spare.memory), (now.world, now.memory))
+    episode = Episode(
+        world,
+        memory,
+        now.words,
+        now.number + where.astype(now.number.dtype),
+        jnp.where(where, 0, now.periods),
+    )
+    return Fleet(episode, fleet.ended & ~where)
 
 
 def step(
-    task: Task, mode: str, fleet: Fleet, spares: Episode | None, actions: Float[AnyArray, "lanes 2"]
+    task: Task, mode: str, fleet: Fleet, spares: Spares | None, actions: Float[AnyArray, "lanes 2"]
 ) -> tuple[Fleet, Step]:
     """One decision in every lane, and the next episode where one has ended, as `mode` says."""
     actions = jnp.moveaxis(jnp.asarray(actions), -1, 0)
@@ -100,6 +117,7 @@ def step(
     if mode == NEXT_STEP:
         assert spares is not None
         fleet = follow(Fleet(episode, decision.ended & ~begun), spares, begun)
+        decision = jax.tree.map(lambda leaf: jnp.where(begun, jnp.zeros((), leaf.dtype), leaf), decision)
     elif mode == SAME_STEP:
         assert spares is not None
         final, ended = seen(task, episode), fleet.ended

@@ -12,9 +12,8 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Float
 
 from sidestep.bridges.gym import fleet as fleets
-from sidestep.bridges.gym.calls import flat, packed, seed_words, unpacked
-from sidestep.bridges.gym.episode import Episode
-from sidestep.bridges.gym.fleet import AHEAD, Fleet
+from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.fleet import AHEAD, Fleet, Spares
 from sidestep.bridges.gym.rendering import Picture, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
@@ -26,7 +25,7 @@ _DRAWN_AT_ONCE = 256
 
 def _launch(task: Task, words: Any, number: Any) -> tuple[list[Any], list[Any], Any]:
     fleet = fleets.launch(task, words, number)
-    return _leaves(fleet), _leaves(fleets.no_spares(fleet)), fleets.seen(task, fleet.episode)
+    return _leaves(fleet), bundled(fleets.no_spares(fleet)), fleets.seen(task, fleet.episode)
 
 
 def _place(task: Task, fleet: Fleet, world: World) -> tuple[list[Any], Any]:
@@ -34,13 +33,13 @@ def _place(task: Task, fleet: Fleet, world: World) -> tuple[list[Any], Any]:
     return _leaves(fleet), fleets.seen(task, fleet.episode)
 
 
-def _follow(task: Task, fleet: Fleet, spares: Episode, where: Any) -> tuple[list[Any], Any]:
+def _follow(task: Task, fleet: Fleet, spares: Spares, where: Any) -> tuple[list[Any], Any]:
     fleet = fleets.follow(fleet, spares, where)
     return _leaves(fleet), fleets.seen(task, fleet.episode)
 
 
-def _draw(task: Task, fleet: Fleet, spares: Episode, lanes: Any, numbers: Any) -> list[Any]:
-    return _leaves(fleets.draw(task, fleet, spares, lanes, numbers))
+def _draw(task: Task, fleet: Fleet, spares: Spares, lanes: Any, numbers: Any) -> list[Any]:
+    return bundled(fleets.draw(task, fleet, spares, lanes, numbers))
 
 
 def _leaves(tree: Any) -> list[Any]:
@@ -48,7 +47,7 @@ def _leaves(tree: Any) -> list[Any]:
 
 
 def _stepper(mode: str) -> Any:
-    def step(task: Task, fleet: Fleet, spares: Episode, actions: Any) -> tuple[Any, ...]:
+    def step(task: Task, fleet: Fleet, spares: Spares, actions: Any) -> tuple[Any, ...]:
         fleet, made = fleets.step(task, mode, fleet, spares, actions)
         return _leaves(fleet), made.observation, made.final, *packed(made.decision)
 
@@ -110,7 +109,7 @@ class PursuedVectorEnv(VectorEnv):
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._task = jax.tree.leaves(self.task)
+        self._task, self._layout = bundled(self.task), bundle_of(self.task)
         self._words = np.zeros((2, self.num_envs), np.uint32)
         # Numbers of the episodes that run, and of the last one of each lane whose start has been drawn.
         self._numbers = np.full(self.num_envs, -1, np.int32)
@@ -122,13 +121,16 @@ class PursuedVectorEnv(VectorEnv):
     @property
     def worlds(self) -> World:
         """All worlds as they are now, with their axis in front. **Raises** `ResetNeeded` before a `reset`."""
-        episode = jax.tree.unflatten(self._structure, [*self._task, *self._now(), *self._spares])[1].episode
+        episode = jax.tree.unflatten(self._layouts[1], self._now()).episode
         return jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), -1, 0), episode.world)
 
     def _now(self) -> list[Any]:
         if self._fleet is None:
             raise gymnasium.error.ResetNeeded("call reset() before anything else")
         return self._fleet
+
+    def _parts(self) -> tuple[list[Any], ...]:
+        return self._task, self._now(), self._spares
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -139,17 +141,16 @@ class PursuedVectorEnv(VectorEnv):
         fresh = self._seed(seed)
         self._numbers = np.where(fresh, 0, self._numbers + 1).astype(np.int32)
         self._drawn = self._numbers.copy()
-        launch = flat(_launch, jax.tree.structure((self.task,)))
-        self._fleet, self._spares, observation = launch(self._task, self._words, self._numbers)
-        shapes = jax.eval_shape(fleets.launch, self.task, self._words, self._numbers)
-        spares = jax.eval_shape(fleets.no_spares, shapes)
-        self._structure = jax.tree.structure((self.task, shapes, spares))
+        launch = flat(_launch, self._layout)
+        self._fleet, self._spares, observation = launch((self._task,), self._words, self._numbers)
+        fleet = jax.eval_shape(fleets.launch, self.task, self._words, self._numbers)
+        spares = bundle_of(jax.eval_shape(fleets.no_spares, fleet))
+        self._layouts = self._layout, jax.tree.structure(fleet), spares
         if "world" in options:
             world = given_world(self.scenario, options["world"], (self.num_envs,))
-            leaves, structure = jax.tree.flatten((self.task, shapes, world))
-            place = flat(_place, structure)
-            given = leaves[len(self._task) + len(self._now()) :]
-            self._fleet, observation = place([*self._task, *self._now(), *given])
+            leaves, structure = jax.tree.flatten(world)
+            place = flat(_place, *self._layouts[:2], structure)
+            self._fleet, observation = place((self._task, self._now(), leaves))
         self._ended = np.zeros(self.num_envs, bool)
         return np.array(observation), {}
 
@@ -185,8 +186,7 @@ class PursuedVectorEnv(VectorEnv):
             )
         self._now()
         self._draw_ahead()
-        leaves = [*self._task, *self._now(), *self._spares]
-        self._fleet, observation = flat(_follow, self._structure)(leaves, mask)
+        self._fleet, observation = flat(_follow, *self._layouts)(self._parts(), mask)
         self._numbers[mask] += 1
         self._ended &= ~mask
         return np.array(observation), {}
@@ -198,12 +198,12 @@ class PursuedVectorEnv(VectorEnv):
         ahead = self._drawn[:, None] + np.arange(1, AHEAD + 1, dtype=np.int32)
         lanes, which = np.nonzero(ahead <= self._numbers[:, None] + AHEAD)
         numbers = ahead[lanes, which]
-        draw, chunk = flat(_draw, self._structure), min(_DRAWN_AT_ONCE, AHEAD * self.num_envs)
+        draw, chunk = flat(_draw, *self._layouts), min(_DRAWN_AT_ONCE, AHEAD * self.num_envs)
         for first in range(0, len(lanes), chunk):
             some = np.full((2, chunk), self.num_envs, np.int32)
             part = lanes[first : first + chunk], numbers[first : first + chunk]
             some[:, : len(part[0])] = part
-            self._spares = draw([*self._task, *self._now(), *self._spares], some[0], some[1])
+            self._spares = draw(self._parts(), some[0], some[1])
         self._drawn = self._numbers + AHEAD
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -222,38 +222,33 @@ class PursuedVectorEnv(VectorEnv):
         terminated = info["captured"] | info["collided"] | info["reached"]
         if mode is AutoresetMode.NEXT_STEP:
             begun = self._ended
-            reward = np.where(begun, 0.0, reward).astype(np.float64)
-            terminated, truncated = terminated & ~begun, truncated & ~begun
             info = self._masked(info, ~begun)
         else:
-            reward, truncated = reward.astype(np.float64), truncated.copy()
             begun = terminated | truncated
             info = self._final(info, final, begun) if mode is AutoresetMode.SAME_STEP else self._masked(info)
         self._ended = terminated | truncated
+        reward = reward.astype(np.float64)
         if mode is not AutoresetMode.DISABLED:
             self._numbers = self._numbers + begun
         return np.array(observation), reward, terminated, truncated, info
 
     def program(self, actions: Float[np.ndarray, "worlds 2"]) -> tuple[Any, ...]:
         """What `step` computes, as arrays of the device, without taking the step."""
-        leaves = [*self._task, *self._now(), *self._spares]
-        return flat(_STEP[self.autoreset_mode.value], self._structure)(leaves, actions)
+        return flat(_STEP[self.autoreset_mode.value], *self._layouts)(self._parts(), actions)
 
     def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Vector infos: beside each entry, which worlds have it; entries of the others are zero."""
-        if mask is None or mask.all():
-            mask = np.ones(self.num_envs, bool)
-        else:
-            info = {
-                name: np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, np.zeros((), value.dtype))
-                for name, value in info.items()
-            }
+        """Vector infos: beside each entry, which worlds have it."""
+        mask = np.ones(self.num_envs, bool) if mask is None else mask
         return {**info, **{f"_{name}": mask for name in info}}
 
     def _final(self, info: dict[str, Any], final: Any, ended: np.ndarray) -> dict[str, Any]:
         """Infos of `SAME_STEP`: those of worlds whose episode ended are in `final_info`."""
         infos = self._masked(info, ~ended)
         if np.any(ended):
+            kept = {name: value.copy() for name, value in info.items()}
+            for value in kept.values():
+                value[ended] = 0
+            infos |= kept
             last = np.full(self.num_envs, None, object)
             for lane in np.flatnonzero(ended):
                 last[lane] = np.array(final[lane])
