@@ -120,7 +120,7 @@ def main() -> None:
             times = "{program_us:.0f} of {step_us:.0f} us compiled"
             spent = "" if name == "plain" else times.format(**case)
             print(
-                f"hold {hold:2}, {case['side']:19}: {middle[name]:12,.0f} steps/s, {case['ratio']:6.1f} times "
+                f"hold {hold:2}, {case['side']:19}: {middle[name]:12,.0f} steps/s, {case['ratio']:5.1f} times "
                 f"plain ({case['ratio_least']:.1f} to {case['ratio_most']:.1f}) {spent}",
                 flush=True,
             )
