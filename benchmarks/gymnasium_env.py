@@ -117,11 +117,12 @@ def main() -> None:
             if name != "plain":
                 case |= compiled_share(environments[name], options.worlds)
             cases.append(case)
+            speed = f"{middle[name]:12,.0f} steps/s, {case['ratio']:5.1f} times plain"
             times = "{program_us:.0f} of {step_us:.0f} us compiled"
             spent = "" if name == "plain" else times.format(**case)
             print(
-                f"hold {hold:2}, {case['side']:19}: {middle[name]:12,.0f} steps/s, {case['ratio']:5.1f} times "
-                f"plain ({case['ratio_least']:.1f} to {case['ratio_most']:.1f}) {spent}",
+                f"hold {hold:2}, {case['side']:19}: {speed} "
+                f"({case['ratio_least']:.1f} to {case['ratio_most']:.1f}) {spent}",
                 flush=True,
             )
     if options.json is not None:

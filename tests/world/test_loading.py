@@ -35,7 +35,7 @@ def refused(*mentions, **overrides):
 
 def test_every_field_is_covered_here():
     assert {field.name for field in fields(Scenario)} == {
-        *POSITIVE, *NOT_NEGATIVE, *COUNTS, *CHOICES, *ARRAYS, "name",
+        *POSITIVE, *NOT_NEGATIVE, *COUNTS, *CHOICES, *ARRAYS, "name", "evader_model", "pursuer_model",
     }  # fmt: skip
 
 

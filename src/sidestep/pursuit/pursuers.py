@@ -15,7 +15,7 @@ from sidestep._arrays import Lanes, Scalar, lane_by_lane, real, stack
 from sidestep.pursuit.game import CaptureGame
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.world.capture_geometry import to_pursuer_frame
-from sidestep.world.robots import limit_wheels, wheels_from_body
+from sidestep.world.robots import wheels_from_body
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
@@ -40,7 +40,7 @@ class Pursuer(eqx.Module):
 
     def __call__(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         """Wheel rim speeds (left, right; m/s) of `world.pursuer`, each within [-V, V]."""
-        return limit_wheels(self.steer(scenario, world, key), scenario.pursuer_speed)
+        return scenario.drivable(self.steer(scenario, world, key))
 
 
 def _toward(
@@ -231,9 +231,7 @@ def pursue(
 
     def steer(world: World, key: Any) -> Float[Array, "m 2 *lanes"]:
         if together is not None:
-            return jax.vmap(limit_wheels, in_axes=(0, None))(
-                together(scenario, world), scenario.pursuer_speed
-            )
+            return jax.vmap(scenario.drivable)(together(scenario, world))
         count = scenario.pursuer_count
         keys = [key] * count if world.lanes else jax.random.split(key, count)
         answers = []

@@ -1,5 +1,10 @@
 """Every shield by name."""
 
+import dataclasses
+
+from sidestep.safety.adapted import AdaptedShield, covered, of_control_point
+from sidestep.safety.barrier_shield import shield_of
+from sidestep.safety.barriers import Barrier
 from sidestep.safety.budget import Budget
 from sidestep.safety.joint import JointShield
 from sidestep.safety.shields import GameShield, NoShield, PaperShield, Shield
@@ -20,9 +25,16 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
 
     **Raises** `ValueError` naming the known shields, or what is wrong with the budget. **Warns**
     `BudgetWarning` once where the budget is more than the game leaves.
+
+    With robots of one's own (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
     """
     if name not in SHIELDS:
         raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS))}")
+    if not scenario.built_in:
+        guarded = of_control_point(scenario)
+        # The others say nothing of what a pursuer can do.
+        guarded = covered(guarded) if name in _BUDGETED else dataclasses.replace(guarded, pursuer_model=None)
+        return AdaptedShield(scenario, make_shield(name, guarded, budget))
     if budget is None:
         return SHIELDS[name](scenario)
     if name not in _BUDGETED:
@@ -31,6 +43,8 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     return _BUDGETED[name](scenario, budget=budget)
 
 
-def as_shield(shield: str | Shield, scenario: Scenario) -> Shield:
-    """`shield` itself, or the one of that name for `scenario`."""
+def as_shield(shield: str | Shield | Barrier, scenario: Scenario) -> Shield:
+    """`shield` itself, the one of that name for `scenario`, or the one that keeps a barrier of one's own."""
+    if isinstance(shield, Barrier):
+        return shield_of(shield, scenario)
     return make_shield(shield, scenario) if isinstance(shield, str) else shield

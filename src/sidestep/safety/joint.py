@@ -134,10 +134,13 @@ class JointShield(Shield):
         game = self._game
         greedy, sides = game(world, nominal, memory.sides)
         m = self.scenario.pursuer_count
-        if self.scenario.obstacle_count == 0 or m == 0:
+        if m == 0 or m + self.scenario.obstacle_count == 1:
             return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides)
-        near = jnp.min(greedy.barriers[m:]) <= self.near_obstacle
-        need = near & (jnp.min(greedy.barriers[:m]) <= self.near_pursuer)
+        # The rows of the nearest pursuer can be kept; whether those of anything beside it can, they do not say.
+        towards_pursuers = jnp.sort(greedy.barriers[:m])
+        near = jnp.min(greedy.barriers[m:], initial=jnp.inf) <= self.near_obstacle
+        near |= jnp.min(towards_pursuers[1:], initial=jnp.inf) <= self.near_obstacle
+        need = near & (towards_pursuers[0] <= self.near_pursuer)
         # What is not known cannot be imagined.
         need &= greedy.status != Status.INVALID
 

@@ -111,7 +111,7 @@ def _finite(components: Float[AnyArray, "..."], axis: int = 0) -> Bool[Array, ".
     return functools.reduce(jnp.logical_and, map(jnp.isfinite, parts))
 
 
-def _decide(
+def decide(
     scenario: Scenario,
     world: World,
     nominal: Float[AnyArray, "2 *lanes"],
@@ -121,6 +121,8 @@ def _decide(
     hard: int,
     known: Bool[Array, "n *lanes"] | None = None,
 ) -> ShieldResult:
+    """The answer of a shield whose rows these are: the first `hard` of them before the others, none at all
+    unless `enforced`. `known` says of each whether it speaks of finite numbers; None asks the world."""
     nominal = jnp.asarray(nominal, rows.values.dtype)
     known = _known(world) if known is None else known
     known &= jnp.isfinite(rows.values)
@@ -182,7 +184,7 @@ class NoShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
         rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
-        return _decide(self.scenario, world, nominal, rows, enforced=False, hard=0), memory
+        return decide(self.scenario, world, nominal, rows, enforced=False, hard=0), memory
 
 
 @final
@@ -207,7 +209,7 @@ class PaperShield(Shield):
     ) -> tuple[ShieldResult, Any]:
         rows = _with_obstacles(RangeBarrier(), self.scenario, world, memory)
         hard = self.scenario.pursuer_count
-        return _decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
+        return decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
 
 
 @final
@@ -257,7 +259,7 @@ class GameShield(Shield):
         towards_pursuers, towards_obstacles = margins(self.scenario, self.budget)
         values = jnp.concatenate([rows.values[:m] + towards_pursuers, rows.values[m:] + towards_obstacles])
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
-        return _decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
+        return decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
 
     def _kept_rows(self, world: World, wish: Any, memory: Any) -> tuple[BarrierRows, Any]:
         """The rows at the distances that are kept, and the sides of the pursuers' axes that they follow."""
@@ -304,7 +306,7 @@ class GameShield(Shield):
             obstacle.rows(self.scenario, world, obstacle.remember(self.scenario, world)),
         )
         known = _known(world)
-        result = _decide(
+        result = decide(
             self.scenario,
             world,
             nominal,

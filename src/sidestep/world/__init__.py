@@ -2,6 +2,8 @@
 
 from sidestep.world.events import Events
 from sidestep.world.loading import PRESETS, ScenarioError, load_scenario, scenario_to_dict
+from sidestep.world.model_probe import EvaderProbe, ModelWarning, probe_evader
+from sidestep.world.models import EvaderModel, EvaderState, PursuerModel
 from sidestep.world.observation import (
     goal_seeking,
     goal_seeking_world,
@@ -16,7 +18,12 @@ from sidestep.world.state import World
 
 __all__ = [
     "PRESETS",
+    "EvaderModel",
+    "EvaderProbe",
+    "EvaderState",
     "Events",
+    "ModelWarning",
+    "PursuerModel",
     "Scenario",
     "ScenarioError",
     "World",
@@ -26,6 +33,7 @@ __all__ = [
     "observation_names",
     "observation_size",
     "observe",
+    "probe_evader",
     "scenario_to_dict",
     "to_action",
     "to_velocity",

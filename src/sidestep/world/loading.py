@@ -18,6 +18,8 @@ import numpy as np
 
 from sidestep._arrays import real
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
+from sidestep.world.model_probe import check_models
+from sidestep.world.models import EvaderModel, PursuerModel
 from sidestep.world.scenario import Scenario
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -46,6 +48,7 @@ _CHOICES = {
     "obstacle_directions": ("fixed", "random"),
     "frame": ("target", "world"),
 }
+_MODELS = {"evader_model": EvaderModel, "pursuer_model": PursuerModel}
 _SHAPES: dict[str, tuple[int | None, ...]] = {
     "obstacle_velocity": (2,),
     "evader_start": (2,),
@@ -112,6 +115,14 @@ def _check_values(values: Mapping[str, Any]) -> None:
             if not fits or not np.all(np.isfinite(array)):
                 wanted = " x ".join("n" if n is None else str(n) for n in shape)
                 _fail(name, value, f"it must be {wanted} finite numbers")
+        elif name in _MODELS:
+            if not isinstance(value, (_MODELS[name], type(None))):
+                _fail(
+                    name,
+                    value,
+                    f"it must be a {_MODELS[name].__name__}, or None for the built-in robot. It is code: "
+                    "give it to load_scenario beside the file",
+                )
         elif name == "name" and not isinstance(value, str):
             _fail(name, value, "it must be text")
 
@@ -176,6 +187,9 @@ def _build(values: dict[str, Any]) -> Scenario:
         if count in values:
             values[count] = int(values[count])
     scenario = Scenario(**values)
+    wrong = check_models(scenario)
+    if wrong:
+        raise ScenarioError("; ".join(wrong))
     _check_scene(scenario)
     if not bool(_some_start_exists(scenario)):
         raise ScenarioError(
@@ -234,12 +248,16 @@ def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
-    """All fields as plain JSON values; `load_scenario` rebuilds the same scenario from them."""
+    """All fields as plain JSON values; `load_scenario` rebuilds the same scenario from them.
+
+    Robots of one's own (`evader_model`, `pursuer_model`) are code, and stand there as text that says what
+    they were: `load_scenario` then asks for them.
+    """
 
     def plain(value: Any) -> Any:
         if isinstance(value, (jax.Array, np.ndarray)):
             # The shortest decimal that rounds to the stored float: 0.1574, not 0.15739999711513519.
             return np.asarray(value).astype(str).astype(float).tolist()
-        return value
+        return repr(value) if isinstance(value, tuple(_MODELS.values())) else value
 
     return {field.name: plain(getattr(scenario, field.name)) for field in fields(scenario)}

@@ -7,20 +7,37 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, apart, fold, length, norm, real, stack
+from sidestep._arrays import (
+    AnyArray,
+    Flag,
+    Lanes,
+    Scalar,
+    apart,
+    fold,
+    lane_by_lane,
+    length,
+    norm,
+    real,
+    stack,
+)
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
+from sidestep.world.models import EvaderModel, EvaderState, PursuerModel, evader_of
 from sidestep.world.robots import (
+    body_velocity,
     closest_approach_driving,
     closest_approach_straight,
     drive,
     glide,
     limit_speed,
     limit_wheels,
+    wheels_from_body,
 )
 from sidestep.world.state import World
 
 _RESET_TRIES = 10_000
+_CHORDS = 8
+"""Straight pieces that the path of an evader of one's own is taken for, within one control period."""
 
 
 class Scenario(eqx.Module):
@@ -47,6 +64,9 @@ class Scenario(eqx.Module):
     **Counts and modes** `pursuer_count`, `obstacle_count`, `episode_steps` (control periods),
     `action` = `"velocity"` (disc |u| <= v_e) or `"heading"` (circle |u| = v_e), `frame` = `"target"` or
     `"world"` (axes of observation and policy action).
+
+    **Robots of one's own** `evader_model`, `pursuer_model`, see `EvaderModel` and `PursuerModel`; None for
+    the omnidirectional evader and the differential drive. They are code: a file cannot hold them.
     """
 
     evader_speed: Scalar = eqx.field(converter=real, default=0.1574)
@@ -69,6 +89,8 @@ class Scenario(eqx.Module):
     pursuer_starts: Float[Array, "m 3"] | None = None
     obstacle_starts: Float[Array, "k 2"] | None = None
     target_start: Float[Array, "2"] | None = None
+    evader_model: EvaderModel | None = None
+    pursuer_model: PursuerModel | None = None
     name: str = eqx.field(static=True, default="paper")
     pursuer_count: int = eqx.field(static=True, default=1)
     obstacle_count: int = eqx.field(static=True, default=1)
@@ -98,6 +120,7 @@ class Scenario(eqx.Module):
             pursuers = self.pursuer_starts
         obstacles = place(obstacle_key, k) if self.obstacle_starts is None else self.obstacle_starts
         drift = jnp.broadcast_to(self.obstacle_velocity, (k, 2))
+        model = self.evader_model
         if self.obstacle_directions == "random":
             angle = jax.random.uniform(drift_key, (k,), dtype=float, minval=-jnp.pi, maxval=jnp.pi)
             speed = jnp.sqrt(jnp.sum(self.obstacle_velocity**2))
@@ -107,6 +130,7 @@ class Scenario(eqx.Module):
             pursuers=pursuers,
             obstacles=jnp.concatenate([obstacles, drift], axis=-1),
             target=place(target_key) if self.target_start is None else self.target_start,
+            evader_state=None if model is None else model.start(self, jax.random.fold_in(key, 6)),
         )
 
     def accepts(self, world: World) -> Flag:
@@ -116,8 +140,10 @@ class Scenario(eqx.Module):
         fixed.
         """
         in_frame = jax.vmap(to_pursuer_frame, in_axes=(None, 0))(world.evader, world.pursuers)
+        # Which pursuers capture at once, and which only by turning first, is known of differential drives.
+        angle = self.usable_angle if self.pursuer_model is None else jnp.zeros_like(self.usable_angle)
         escape = jax.vmap(capture_set_distance, in_axes=(0, None, None))(
-            in_frame, self.usable_angle, self.capture_distance
+            in_frame, angle, self.capture_distance
         )
         evader_to_obstacle = norm(world.obstacles[:, :2] - world.evader)
         target_to_obstacle = norm(world.obstacles[:, :2] - world.target)
@@ -173,18 +199,20 @@ class Scenario(eqx.Module):
         period = self.control_period
         velocity = self.executable(action)
         shape = (self.pursuer_count, *velocity.shape)
-        wheels = jax.vmap(limit_wheels, in_axes=(0, None))(
-            jnp.reshape(wheel_speeds, shape), self.pursuer_speed
-        )
-
-        def pass_by(obstacle: Array) -> Lanes:
-            return closest_approach_straight(world.evader - obstacle[:2], velocity - obstacle[2:], period)
-
-        # Every event asks for it, and in lanes XLA would compute it anew for each of them.
-        given = (self, world, velocity, wheels)
-        to_pursuers = apart(_approaches, *given) if world.lanes else _approaches(*given)
-        to_obstacles = jax.vmap(pass_by)(world.obstacles)
-        to_target = closest_approach_straight(world.evader - world.target, velocity, period)
+        wheels = jax.vmap(self.drivable)(jnp.reshape(wheel_speeds, shape))
+        if self.evader_model is None:
+            given = (self, world, velocity, wheels, period)
+            # Every event asks for them, and in lanes XLA would compute them anew for each.
+            least = apart(Scenario._approaches, *given) if world.lanes else Scenario._approaches(*given)
+            to_pursuers, to_obstacles, to_target = least
+        else:
+            # One program for all pieces: written out they take long to compile.
+            to_pursuers, to_obstacles, to_target = jax.tree.map(
+                lambda least: jnp.min(least, axis=0),
+                jax.vmap(self._approaches, in_axes=(0, 0, None, None))(
+                    *self._pieces(world, velocity, wheels), wheels, period / _CHORDS
+                ),
+            )
         pursuer_clearance = fold(jnp.minimum, to_pursuers, jnp.inf) - self.capture_distance
         obstacle_clearance = fold(jnp.minimum, to_obstacles, jnp.inf) - self.collision_distance
 
@@ -206,6 +234,41 @@ class Scenario(eqx.Module):
             obstacle_clearance=obstacle_clearance,
         )
 
+    def _approaches(
+        self, world: World, velocity: Array, wheels: Array, duration: Scalar
+    ) -> tuple[Float[Array, "m *lanes"], Float[Array, "k *lanes"], Lanes]:
+        """Least distances (m) to pursuers, obstacles and target, while the evader moves straight."""
+
+        def approach(pose: Array, wheel: Array) -> Lanes:
+            return closest_approach_driving(
+                world.evader, velocity, pose, wheel, self.pursuer_half_axle, duration
+            )
+
+        def pass_by(obstacle: Array) -> Lanes:
+            return closest_approach_straight(world.evader - obstacle[:2], velocity - obstacle[2:], duration)
+
+        to_pursuers = jax.vmap(approach)(world.pursuers, wheels)
+        to_obstacles = jax.vmap(pass_by)(world.obstacles)
+        return (
+            to_pursuers,
+            to_obstacles,
+            closest_approach_straight(world.evader - world.target, velocity, duration),
+        )
+
+    def _pieces(
+        self, world: World, command: Array, wheels: Array
+    ) -> tuple[World, Float[Array, "pieces 2 *lanes"]]:
+        """The period in pieces, one behind the other along a first axis: the worlds in which they begin, and
+        the velocities (m/s) with which the evader drives their chords instead of its path.
+
+        A path with acceleration a is off its chords by up to a (T/8)^2/8, 5 um for 1 m/s^2 at 20 Hz.
+        """
+        piece = self.control_period / _CHORDS
+        times = piece * jnp.arange(_CHORDS + 1).astype(piece.dtype)
+        worlds = jax.vmap(lambda time: self._moved(world, command, wheels, time))(times)
+        chords = (worlds.evader[1:] - worlds.evader[:-1]) / piece
+        return jax.tree.map(lambda leaf: leaf[:-1], worlds), chords
+
     def moved(
         self,
         world: World,
@@ -213,23 +276,57 @@ class Scenario(eqx.Module):
         wheel_speeds: Float[Array, "m 2 *lanes"],
     ) -> World:
         """Where everything is one control period later, for commands that the robots can execute."""
-        period, obstacles = self.control_period, world.obstacles
         # Counting whole periods keeps float32 time exact enough to compare with the limit.
-        periods = jnp.round(world.time / period) + 1.0
+        periods = jnp.round(world.time / self.control_period) + 1.0
+        there = self._moved(world, velocity, wheel_speeds, self.control_period)
         return eqx.tree_at(
-            lambda w: (w.evader, w.pursuers, w.obstacles, w.time, w.evader_velocity, w.wheel_speeds),
-            world,
-            (
-                glide(world.evader, velocity, period),
-                jax.vmap(drive, in_axes=(0, 0, None, None))(
-                    world.pursuers, wheel_speeds, self.pursuer_half_axle, period
-                ),
-                jnp.concatenate([obstacles[:, :2] + obstacles[:, 2:] * period, obstacles[:, 2:]], axis=1),
-                periods * period,
-                velocity,
-                wheel_speeds,
-            ),
+            lambda w: (w.time, w.wheel_speeds), there, (periods * self.control_period, wheel_speeds)
         )
+
+    def _moved(self, world: World, velocity: Array, wheel_speeds: Array, duration: Scalar) -> World:
+        """Where everything is after `duration` (s); neither time nor wheel speeds are brought up to date."""
+        obstacles = world.obstacles
+        pursuers = jax.vmap(drive, in_axes=(0, 0, None, None))(
+            world.pursuers, wheel_speeds, self.pursuer_half_axle, duration
+        )
+        drifted = jnp.concatenate([obstacles[:, :2] + obstacles[:, 2:] * duration, obstacles[:, 2:]], axis=1)
+        evader = glide(world.evader, velocity, duration)
+        if self.evader_model is not None:
+            robot = self._evader_after(world, velocity, duration)
+            evader, velocity = robot.position, robot.velocity
+            world = eqx.tree_at(lambda w: w.evader_state, world, robot.state)
+        return eqx.tree_at(
+            lambda w: (w.evader, w.pursuers, w.obstacles, w.evader_velocity),
+            world,
+            (evader, pursuers, drifted, velocity),
+        )
+
+    def _evader_after(self, world: World, command: Array, duration: Scalar) -> EvaderState:
+        model = self.evader_model
+        assert model is not None
+
+        def after(robot: EvaderState, command: Array) -> EvaderState:
+            return model.after(self, robot, command, duration)
+
+        return lane_by_lane(after, world.lanes, evader_of(world), command)
+
+    def drivable(self, wheel_speeds: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
+        """The wheel speeds (m/s) a pursuer drives when told `wheel_speeds`; those not finite count as 0."""
+        if self.pursuer_model is None:
+            return limit_wheels(wheel_speeds, self.pursuer_speed)
+        wheels = stack(*(jnp.where(jnp.isfinite(speed), speed, 0.0) for speed in wheel_speeds))
+        speed, turn_rate = body_velocity(wheels, self.pursuer_half_axle)
+        limit, lanes = self.pursuer_model.limit, wheels.ndim - 1
+        speed, turn_rate = lane_by_lane(
+            lambda speed, turn_rate: limit(self, speed, turn_rate), lanes, speed, turn_rate
+        )
+        return wheels_from_body(speed, turn_rate, self.pursuer_half_axle)
+
+    @property
+    def built_in(self) -> bool:
+        """Whether the robots are the omnidirectional evader and the differential drive, which barriers,
+        certificate and falsifier speak of."""
+        return self.evader_model is None and self.pursuer_model is None
 
     def executable(self, velocity: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
         """The velocity (m/s) the evader drives when told `velocity`: on the disc, or on the circle.
@@ -247,16 +344,3 @@ class Scenario(eqx.Module):
         x, y = jnp.where(moving, limited[0] / safe, 1.0), jnp.where(moving, limited[1] / safe, 0.0)
         scale = self.evader_speed / length(x, y)
         return stack(x * scale, y * scale)
-
-
-def _approaches(
-    scenario: Scenario, world: World, velocity: Float[Array, "2 *lanes"], wheels: Float[Array, "m 2 *lanes"]
-) -> Float[Array, "m *lanes"]:
-    """The smallest distance (m) to each pursuer within a control period."""
-
-    def approach(pose: Array, wheel: Array) -> Lanes:
-        return closest_approach_driving(
-            world.evader, velocity, pose, wheel, scenario.pursuer_half_axle, scenario.control_period
-        )
-
-    return jax.vmap(approach)(world.pursuers, wheels)

@@ -16,7 +16,8 @@ class World(eqx.Module):
     a reset): pursuers may lead the evader, and the evader may measure the pursuers' motion.
 
     **Attributes:** `evader (2,)`; `pursuers (m, 3)` x, y, heading; `obstacles (k, 4)` x, y, vx, vy;
-    `target (2,)`; `time ()` in s; `evader_velocity (2,)`; `wheel_speeds (m, 2)` left, right.
+    `target (2,)`; `time ()` in s; `evader_velocity (2,)`; `wheel_speeds (m, 2)` left, right;
+    `evader_state (s,)` what a model of one's own keeps of the evader (`EvaderModel`), None without one.
     """
 
     evader: Float[Array, "2"]
@@ -26,6 +27,7 @@ class World(eqx.Module):
     time: Scalar
     evader_velocity: Float[Array, "2"]
     wheel_speeds: Float[Array, "m 2"]
+    evader_state: Float[Array, "s"] | None
 
     def __init__(
         self,
@@ -36,6 +38,7 @@ class World(eqx.Module):
         time: Float[AnyArray, ""] | float = 0.0,
         evader_velocity: Float[AnyArray, "2"] | None = None,
         wheel_speeds: Float[AnyArray, "m 2"] | None = None,
+        evader_state: Float[AnyArray, "s"] | None = None,
     ):
         self.evader = real(evader)
         self.pursuers = real(pursuers)
@@ -50,6 +53,7 @@ class World(eqx.Module):
             if wheel_speeds is None
             else real(wheel_speeds)
         )
+        self.evader_state = None if evader_state is None else real(evader_state)
 
     @property
     def lanes(self) -> int:
