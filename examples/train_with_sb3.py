@@ -53,7 +53,8 @@ def main():
         layers = {"net_arch": [256, 256]}
         model = TD3("MlpPolicy", Monitor(env), action_noise=noise, policy_kwargs=layers, **common)
     else:
-        model = SAC("MlpPolicy", Monitor(env), **common)
+        # Entropy at its usual price of 1 outweighs the target: it would pay to wander until the time is up.
+        model = SAC("MlpPolicy", Monitor(env), ent_coef="auto_0.01", **common)
     model.learn(options.steps)
     print(f"training, {options.steps} decisions: {dict(env.outcomes)}", flush=True)
 
