@@ -20,6 +20,8 @@ from sidestep.commands.train import Train
 from sidestep.learning import train
 from sidestep.safety.catalogue import SHIELDS
 from sidestep.trials import load_survey
+from sidestep.trials.campaign import load_campaign, run_task
+from sidestep.trials.campaign.jobs import figure_names, flat
 from sidestep.trials.reproduction import reproduce
 
 LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
@@ -96,6 +98,14 @@ def test_untrained_policy_is_evaluated_under_the_joint_shield_by_default(tmp_pat
     figures = json.loads(path.read_text())
     assert figures["shield"] == "joint"
     assert figures["timed_out"] == figures["episodes"] == 2
+    # A job of a campaign is the command that it stands for.
+    (tmp_path / "grid.toml").write_text(
+        '[grid]\nscenario = "calm"\n[scenarios.calm]\nepisode_steps = 30\nobstacle_count = 0\n'
+        "[settings]\nepisodes = 2\n"
+    )
+    (job,) = load_campaign(tmp_path / "grid.toml").jobs
+    of_job = run_task(job.task, None)
+    assert of_job == {name: figures[name] for name in of_job}
 
 
 def test_resumed_run_is_the_longer_run(run, tmp_path):
@@ -139,6 +149,29 @@ def test_interrupt_stops_cleanly_and_the_run_goes_on_from_there(run, tmp_path):
     assert [json.loads(line)["episode"] for line in lines] == list(range(1, 1501))
     # The first episodes are those of the run that was asked for two only.
     assert lines[:2] == (run[0] / "metrics.jsonl").read_text().splitlines()
+
+
+def test_training_of_a_campaign_is_the_run_and_goes_on_where_it_was_left(run, tmp_path):
+    out, _ = run
+    file = tmp_path / "grid.toml"
+    learner = "\n".join(pair.replace("=", " = ") for pair in LEARNER)
+    file.write_text(
+        'kind = "train"\n[grid]\nshield = "game"\nseed = 5\nscenario = "brief"\nlearner = "small"\n'
+        f"[scenarios.brief]\nepisode_steps = 60\n[learners.small]\n{learner}\n"
+        "[settings]\nepisodes = 2\nevaluation_episodes = 4\nbatch = 512\n"
+    )
+    (job,) = load_campaign(file).jobs
+    # Trained already, and killed before its result was kept.
+    folder = tmp_path / "job"
+    shutil.copytree(out, folder)
+    (folder / "policy.npz").unlink()
+    figures = run_task(job.task, folder)
+    assert set(figure_names("train")) == set(flat(figures))
+    assert figures["training_episodes"] == 2
+    assert figures["training_env_steps"] == json.loads((out / "summary.json").read_text())["env_steps"]
+    assert figures["episodes"] == 4
+    assert (folder / "metrics.jsonl").read_bytes() == (out / "metrics.jsonl").read_bytes()
+    assert (folder / "policy.npz").is_file()
 
 
 def test_report_of_a_run_needs_no_network(run, monkeypatch):
@@ -203,7 +236,8 @@ def test_bad_input_is_named_and_nothing_is_written(arguments, named, tmp_path, c
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["train"], ["evaluate"], ["reproduce"], ["certify"], ["falsify"], ["report"]]
+    "command",
+    [[], ["train"], ["evaluate"], ["reproduce"], ["certify"], ["falsify"], ["report"], ["campaign"]],
 )
 def test_help_of_every_command(command, capsys):
     with pytest.raises(SystemExit) as stop:

@@ -82,6 +82,8 @@ def test_import_needs_nothing_optional(module):
         "clarabel",
         "mujoco",
         "onnx",
+        "distributed",
+        "pyarrow",
         "rclpy",
     ]
     code = (

@@ -10,7 +10,19 @@ import tyro
 from tyro.conf import subcommand
 
 from sidestep._compiled import keep_compiled_programs
-from sidestep.commands import bench, certify, evaluate, export, falsify, play, report, reproduce, train, twin
+from sidestep.commands import (
+    bench,
+    campaign,
+    certify,
+    evaluate,
+    export,
+    falsify,
+    play,
+    report,
+    reproduce,
+    train,
+    twin,
+)
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
@@ -20,6 +32,7 @@ _RUN: dict[type, Callable[..., int]] = {
     falsify.Falsify: falsify.run,
     play.Play: play.run,
     report.Report: report.run,
+    campaign.Campaign: campaign.run,
     export.Export: export.run,
     twin.Twin: twin.run,
     bench.Bench: bench.run,
@@ -36,6 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[falsify.Falsify, subcommand("falsify")]
         | Annotated[play.Play, subcommand("play")]
         | Annotated[report.Report, subcommand("report")]
+        | Annotated[campaign.Campaign, subcommand("campaign")]
         | Annotated[export.Export, subcommand("export")]
         | Annotated[twin.Twin, subcommand("twin")]
         | Annotated[bench.Bench, subcommand("bench")],

@@ -19,7 +19,9 @@ def numpy_pursuer(scenario, world, key):
     return np.array([0.1, 0.05], np.float32) * float(world.evader[0] > 0.0)
 
 
-@pytest.mark.parametrize("shield, name", [("game", "nash"), ("paper", "numpy")])
+@pytest.mark.parametrize(
+    "shield, name", [("game", "nash"), pytest.param("paper", "numpy", marks=pytest.mark.slow)]
+)
 def test_worlds_in_lanes_do_what_each_does_alone(shield, name):
     scenario = load_scenario("paper", obstacle_count=2, pursuer_count=1 if name == "nash" else 2)
     guard = make_shield(shield, scenario)

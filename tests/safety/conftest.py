@@ -17,6 +17,16 @@ _SHARED = (
     "test_gradients_through_a_shield_are_finite",
 )
 
+# In float32 only: nothing in them hangs on rounding.
+_TOO_LONG_TWICE = (
+    "test_jit_vmap_and_plain_calls_agree",
+    "test_one_broken_world_of_a_batch_does_not_touch_the_others",
+    "test_barriers_are_listed_pursuers_first",
+    "test_between_pursuer_and_obstacle_the_pursuers_row_is_kept_first",
+    "test_in_heading_mode_the_robot_never_slows_down",
+    "test_far_from_everyone_nobody_interferes",
+)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long to compile is tested by name: `joint` in float64, and what is not about it."""
@@ -24,10 +34,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         parameters = getattr(getattr(item, "callspec", None), "params", {})
         if parameters.get("name") == "joint" and parameters.get("precision"):
             item.add_marker(pytest.mark.slow)
-        if (
-            parameters.get("precision")
-            and getattr(item, "originalname", "") == "test_jit_vmap_and_plain_calls_agree"
-        ):
+        if parameters.get("precision") and getattr(item, "originalname", "") in _TOO_LONG_TWICE:
             item.add_marker(pytest.mark.slow)
         if parameters.get("name") == "joint" and getattr(item, "originalname", "") in _SHARED:
             item.add_marker(pytest.mark.slow)

@@ -70,7 +70,15 @@ def _filter(batch, hard=0):
     return np.asarray(answer.action), np.asarray(answer.status)
 
 
-@pytest.mark.parametrize("k, count", [(1, 2000), (2, 8000), (3, 5000), (5, 3000), (8, 2000)])
+@pytest.mark.parametrize(
+    "k, count",
+    [
+        (2, 8000),
+        (3, 5000),
+        (8, 2000),
+        *(pytest.param(*p, marks=pytest.mark.slow) for p in ((1, 2000), (5, 3000))),
+    ],
+)
 def test_no_feasible_action_is_closer_than_the_filters(problems, k, count):
     batch = problems(count, k)
     normals, offsets = batch.unit_rows()

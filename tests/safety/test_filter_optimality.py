@@ -57,7 +57,9 @@ def test_no_action_near_or_far_is_better(x64, problems, k, hard):
     _assert_undominated(batch, hard, action, near * np.minimum(1.0, batch.limit / speed))
 
 
-@pytest.mark.parametrize("k, hard", [(1, 1), (2, 1), (4, 2), (6, 0)])
+@pytest.mark.parametrize(
+    "k, hard", [(2, 1), (4, 2), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((1, 1), (6, 0)))]
+)
 def test_on_the_circle_no_heading_of_a_dense_scan_is_better(x64, problems, k, hard):
     batch = problems(110, k, seed=14)
     answer = _solve(batch, hard=hard, circle=True)

@@ -55,7 +55,7 @@ def _exact_distance(nominal, normals, offsets, limit):
         return float(min(feasible)) if feasible else None
 
 
-@pytest.mark.parametrize("k", [2, 3])
+@pytest.mark.parametrize("k", [pytest.param(2, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("family", ["nearly parallel", "equality", "duplicate", "boundary", "random"])
 def test_an_answer_is_exact_up_to_moving_each_row_by_rounding(precision, problems, family, k):
     dtype = np.dtype(np.float64 if precision else np.float32)

@@ -22,8 +22,8 @@ def test_outlines_are_the_boundaries_of_the_sets():
     "fields, options",
     [
         ({"evader_speed": 0.21}, {"start": (0.4, 0.2)}),
-        ({"evader_speed": 0.21}, {"walls": True}),
-        ({}, {"half_axle": 0.0}),
+        pytest.param({"evader_speed": 0.21}, {"walls": True}, marks=pytest.mark.slow),
+        pytest.param({}, {"half_axle": 0.0}, marks=pytest.mark.slow),
         ({"capture_distance": 0.17}, {"position_error": 3e-3, "delay": 0.03}),
     ],
 )

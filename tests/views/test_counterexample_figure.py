@@ -16,7 +16,7 @@ PAPER = Scenario()
 
 @pytest.mark.parametrize(
     "parts",
-    [{}, {"obstacles": 0}, {"pursuers": 2}, {"reverse": True}, {"gap": 0.055}, {"steps": 1}],
+    [{"obstacles": 0}, {"pursuers": 2}, {"reverse": True, "gap": 0.055}, {"steps": 1}],
     ids=str,
 )
 def test_figure_of_any_episode_shows_something(tmp_path, chase, parts):

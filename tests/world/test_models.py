@@ -57,10 +57,9 @@ def _step_all(scenario, worlds, actions, wheels):
 
 
 def test_obedient_model_is_the_built_in_evader(x64):
-    plain = load_scenario("paper", obstacle_count=2, pursuer_count=2)
-    own = load_scenario("paper", obstacle_count=2, pursuer_count=2, evader_model=Obedient())
+    plain, own = load_scenario("paper"), load_scenario("paper", evader_model=Obedient())
     rng = np.random.default_rng(0)
-    actions, wheels = (jnp.asarray(rng.uniform(-0.3, 0.3, shape)) for shape in ((16, 2), (16, 2, 2)))
+    actions, wheels = (jnp.asarray(rng.uniform(-0.3, 0.3, shape)) for shape in ((16, 2), (16, 1, 2)))
     world = _random_worlds(own)
     plain_world = eqx.tree_at(lambda w: w.evader_state, world, None, is_leaf=lambda leaf: leaf is None)
     moved, events = _step_all(own, world, actions, wheels)

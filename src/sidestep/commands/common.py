@@ -81,6 +81,7 @@ class _Bar(abc.ABC):
     """
 
     bar_from_width: ClassVar[int] = 80
+    first_note: ClassVar[str] = "compiling"
 
     def __init__(self, console: Console, label: str):
         from rich.console import Console as RichConsole
@@ -97,7 +98,7 @@ class _Bar(abc.ABC):
             TimeElapsedColumn(),
             console=screen,
         )
-        self._task = self._progress.add_task(label, total=None, note="compiling")
+        self._task = self._progress.add_task(label, total=None, note=self.first_note)
 
     def __enter__(self) -> Callable[..., None]:
         self._progress.__enter__()
@@ -130,3 +131,13 @@ class CountBar(_Bar):
     def update(self, *values: Any) -> None:
         finished, total = values
         self._progress.update(self._task, total=total, completed=finished, note="")
+
+
+class CampaignBar(_Bar):
+    """Finished of all, and how the workers are."""
+
+    first_note = "starting workers"
+
+    def update(self, *values: Any) -> None:
+        finished, total, note = values
+        self._progress.update(self._task, total=total, completed=finished, note=note)

@@ -136,7 +136,7 @@ class JointShield(Shield):
         m = self.scenario.pursuer_count
         if m == 0 or m + self.scenario.obstacle_count == 1:
             return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides)
-        # The rows of the nearest pursuer can be kept; whether those of anything beside it can, they do not say.
+        # The rows of the nearest pursuer can be kept; whether those of anything beside it can is not said.
         towards_pursuers = jnp.sort(greedy.barriers[:m])
         near = jnp.min(greedy.barriers[m:], initial=jnp.inf) <= self.near_obstacle
         near |= jnp.min(towards_pursuers[1:], initial=jnp.inf) <= self.near_obstacle

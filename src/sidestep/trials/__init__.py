@@ -16,6 +16,7 @@ from sidestep.trials.rollout import (
 )
 from sidestep.trials.statistics import (
     interquartile_mean,
+    probability_of_improvement,
     stratified_bootstrap,
     wilson_interval,
     zero_event_bound,
@@ -40,6 +41,7 @@ __all__ = [
     "load_episode",
     "load_survey",
     "load_trajectory",
+    "probability_of_improvement",
     "rollout",
     "save_survey",
     "save_trajectory",

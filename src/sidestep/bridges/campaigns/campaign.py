@@ -1,0 +1,266 @@
+"""How does a campaign get done? Workers are handed one job each; what is there already is not run again."""
+
+from __future__ import annotations
+
+import queue
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sidestep.bridges.campaigns.cluster import LOCAL, connected, local_size, name_of
+from sidestep.bridges.campaigns.worker import run_on_worker
+from sidestep.bridges.packages import needed
+
+if TYPE_CHECKING:
+    from sidestep.trials.campaign import Campaign, Job, Task
+
+_LOOK_SECONDS = 1.0
+"""How often to look for new and lost workers while no job ends."""
+_MOST_DEATHS = 3
+"""Workers that may die under one job."""
+Show = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job without a result, and why."""
+
+    job: Job
+    reason: str
+
+
+@dataclass
+class CampaignOutcome:
+    """What became of a campaign's jobs.
+
+    **Attributes:** `jobs` asked for; `earlier` of them were there already; `ran` ended with a result now;
+    `failed` did not; `damaged` result files were set aside since the folder was begun; `lost_workers` were
+    there and then not; `stopped` is why it ended before its end, None if it did not; `seconds` from the first
+    worker to the last result.
+    """
+
+    jobs: int
+    earlier: int
+    ran: int = 0
+    failed: list[Failure] = field(default_factory=list)
+    damaged: int = 0
+    lost_workers: int = 0
+    workers: int = 0
+    stopped: str | None = None
+    seconds: float = 0.0
+
+    @property
+    def done(self) -> int:
+        """Jobs with a result."""
+        return self.earlier + self.ran
+
+    @property
+    def complete(self) -> bool:
+        """Whether every job has a result."""
+        return self.done == self.jobs
+
+
+def _quiet(done: int, jobs: int, note: str) -> None:
+    pass
+
+
+def run_campaign(
+    campaign: Campaign,
+    folder: str | Path,
+    *,
+    scheduler: Any = LOCAL,
+    workers: int | None = None,
+    threads_per_worker: int | None = None,
+    progress: Show = _quiet,
+    run: Callable[[Task, Path | None], Any] | None = None,
+) -> CampaignOutcome:
+    """Run the jobs of a campaign that have no result in `folder` yet, and write `results.parquet` there.
+
+    A job whose worker dies is run again, on another worker and after the others of its kind; one under which
+    three have died has failed, and takes no other with it. A job that raises is not run again now, but by the
+    next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one goes on.
+
+    **Arguments:** `scheduler` `local`, the address of one that runs, or a cluster object of Dask's; `workers`
+    and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
+    place of `run_task`.
+
+    **Raises** `ValueError` when another call works on the folder, when it holds something else, when no
+    scheduler answers, and for bad options; and when the extra `cluster` is missing.
+    """
+    from sidestep.bridges.campaigns.table import write_table
+    from sidestep.trials.campaign import Store, campaign_rows
+
+    for package in ("distributed", "pyarrow"):
+        needed(package, "cluster", "campaigns need")
+    if scheduler == LOCAL:
+        local_size(workers, threads_per_worker)
+    store = Store(folder)
+    with store.alone():
+        store.begin(campaign.name, campaign.text)
+        todo = [job for job in campaign.jobs if store.read(job.id) is None]
+        outcome = CampaignOutcome(len(campaign.jobs), len(campaign.jobs) - len(todo))
+        begun = time.monotonic()
+        try:
+            if todo:
+                with connected(scheduler, workers, threads_per_worker) as client:
+                    begun = time.monotonic()
+                    _Dispatch(client, store, outcome, progress, run).all(todo)
+        except KeyboardInterrupt:
+            outcome.stopped = "interrupted"
+        except SchedulerLostError:
+            outcome.stopped = f"the scheduler at {name_of(scheduler)} is gone"
+        finally:
+            outcome.seconds = time.monotonic() - begun
+            outcome.damaged = store.damaged()
+            rows = campaign_rows(campaign.jobs, store)
+            # Also what workers put there after the command had lost them.
+            outcome.ran = len(rows) - outcome.earlier
+            write_table(store.folder / "results.parquet", rows)
+    return outcome
+
+
+class _Waiting:
+    """Jobs that wait, in groups that differ in nothing but the seed and so run the same compiled programs.
+
+    A worker stays with its group while it lasts, and begins the one at which the fewest are: side by side
+    they compile different programs, where all would compile the first, then the second.
+    """
+
+    def __init__(self, jobs: Iterable[Job]):
+        self.groups: dict[str, deque[Job]] = {}
+        self.at: dict[str, str] = {}
+        for job in jobs:
+            self.put(job)
+
+    def put(self, job: Job) -> None:
+        """Behind the others of its group."""
+        group = repr({name: label for name, label in job.labels.items() if name != "seed"})
+        self.groups.setdefault(group, deque()).append(job)
+
+    def __bool__(self) -> bool:
+        return bool(self.groups)
+
+    def next_for(self, address: str) -> Job:
+        """The next job for this worker; there must be one."""
+        group = self.at.get(address)
+        if group not in self.groups:
+            others = [at for worker, at in self.at.items() if worker != address]
+            group = min(self.groups, key=lambda name: (others.count(name), -len(self.groups[name])))
+            self.at[address] = group
+        job = self.groups[group].popleft()
+        if not self.groups[group]:
+            del self.groups[group]
+        return job
+
+
+class SchedulerLostError(Exception):
+    """The connection to the scheduler broke."""
+
+
+class _Dispatch:
+    """Jobs on their way to workers and back, one for each worker at a time, so that one death is one job's.
+
+    A job is for its worker alone. Dask may choose another, but a task that merely prefers a worker, and finds
+    none alive when that one dies, is never given to those that come later.
+    """
+
+    def __init__(self, client: Any, store: Any, outcome: CampaignOutcome, progress: Show, run: Any):
+        from sidestep import __version__
+
+        self.client, self.store, self.outcome, self.progress = client, store, outcome, progress
+        # What this call submits is its own: another call's job of the same name is another key.
+        self.call = uuid.uuid4().hex
+        self.about = (str(store.folder.absolute()), store.token, __version__, run)
+        self.ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.at_work: dict[Any, tuple[Job, str]] = {}
+        self.waiting = _Waiting([])
+        self.deaths: Counter[str] = Counter()
+        self.done: set[str] = set()
+        self.known: set[str] = set()
+        self.submitted = 0
+
+    def all(self, jobs: Iterable[Job]) -> None:
+        """Every job to its end. **Raises** `SchedulerLostError`."""
+        self.waiting = _Waiting(jobs)
+        while self.waiting or self.at_work:
+            alive = self.workers()
+            for future, (job, address) in list(self.at_work.items()):
+                if address not in alive:
+                    self.died(future, job)
+            for address in sorted(alive - {address for _, address in self.at_work.values()}):
+                if self.waiting:
+                    self.submit(self.waiting.next_for(address), address)
+            self.show(alive)
+            try:
+                self.take(self.ended.get(timeout=_LOOK_SECONDS))
+            except queue.Empty:
+                continue
+        self.show(self.known)
+
+    def workers(self) -> set[str]:
+        """Addresses of the workers that are there."""
+        if self.client.status != "running":
+            raise SchedulerLostError
+        try:
+            alive = set(self.client.nthreads())
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise SchedulerLostError from error
+        self.outcome.lost_workers += len(self.known - alive)
+        self.outcome.workers = max(self.outcome.workers, len(alive))
+        self.known = alive
+        return alive
+
+    def submit(self, job: Job, address: str) -> None:
+        self.submitted += 1
+        future = self.client.submit(
+            run_on_worker, job.task, *self.about,
+            key=("sidestep-job", job.id, self.call, self.submitted), pure=False, workers=[address],
+        )  # fmt: skip
+        self.at_work[future] = (job, address)
+        future.add_done_callback(self.ended.put)
+
+    def died(self, future: Any, job: Job) -> None:
+        """The worker of a job is gone: another one's turn, unless too many are."""
+        del self.at_work[future]
+        future.cancel()
+        self.deaths[job.id] += 1
+        if self.deaths[job.id] < _MOST_DEATHS:
+            self.waiting.put(job)
+        else:
+            self.outcome.failed.append(Failure(job, f"{_MOST_DEATHS} workers died while they ran it"))
+
+    def take(self, future: Any) -> None:
+        """What became of a job that ended."""
+        from distributed import KilledWorker
+
+        if future not in self.at_work:
+            # Its worker was taken for dead; what it finished all the same is in the folder.
+            return
+        job, _ = self.at_work[future]
+        if future.status in ("cancelled", "lost"):
+            raise SchedulerLostError
+        if future.status == "finished":
+            del self.at_work[future]
+            self.store.keep(future.result())
+            self.done.add(job.id)
+            self.outcome.ran = len(self.done)
+            return
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            self.died(future, job)
+            return
+        del self.at_work[future]
+        self.outcome.failed.append(Failure(job, f"{type(error).__name__}: {error}"))
+
+    def show(self, alive: set[str]) -> None:
+        outcome = self.outcome
+        notes = [f"{len(alive)} workers" if len(alive) != 1 else "1 worker"]
+        if outcome.lost_workers:
+            notes.append(f"{outcome.lost_workers} lost")
+        if outcome.failed:
+            notes.append(f"{len(outcome.failed)} failed")
+        self.progress(outcome.done, outcome.jobs, ", ".join(notes))

@@ -1,0 +1,165 @@
+"""`sidestep campaign`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from sidestep.commands.common import CampaignBar, write_json_file
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sidestep.bridges.campaigns import CampaignOutcome
+    from sidestep.trials.campaign import Campaign as Plan
+    from sidestep.trials.campaign import Comparison
+
+_FAILURES_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Run a grid of trainings or evaluations over cores or machines; the same command goes on with it."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
+    """Campaign file: what to run, over which seeds, scenarios, shields and pursuers."""
+    out: Path | None = None
+    """Folder for the results, a new one or this campaign's; by default runs/ and the file's name."""
+    scheduler: Annotated[str, tyro.conf.arg(metavar="local|tcp://HOST:PORT")] = "local"
+    """Workers on this machine, or those of a Dask scheduler that runs already."""
+    workers: int | None = None
+    """Local workers, one job each at a time; one per core by default."""
+    threads_per_worker: int | None = None
+    """Cores for each local worker's job; an equal share of all by default."""
+    dry_run: bool = False
+    """Only check the file and say how many jobs it asks for."""
+    json: Path | None = None
+    """Also write counts, failures and comparisons to this file."""
+
+
+def run(command: Campaign, console: Console) -> int:
+    """Run `sidestep campaign`; returns the exit status: 1 when a job failed or the scheduler was lost."""
+    from sidestep.trials.campaign import Store, campaign_rows, load_campaign
+
+    plan = load_campaign(command.file)
+    folder = command.out or Path("runs") / command.file.stem
+    if command.dry_run:
+        done = sum(Store(folder).read(job.id) is not None for job in plan.jobs)
+        console.print(f"{plan.name}: {len(plan.jobs)} jobs, {done} of them done in {folder}", highlight=False)
+        return 0
+    from sidestep.bridges.campaigns import run_campaign
+
+    with CampaignBar(console, plan.name) as show:
+        outcome = run_campaign(
+            plan, folder, scheduler=command.scheduler, workers=command.workers,
+            threads_per_worker=command.threads_per_worker, progress=show,
+        )  # fmt: skip
+    rows = campaign_rows(plan.jobs, Store(folder))
+    comparisons, without = _comparisons(plan, rows)
+    for table in comparison_tables(comparisons):
+        console.print(table)
+    for words in without:
+        console.print(f"Not compared: {words}", highlight=False, soft_wrap=True)
+    _say(command, folder, outcome, rows, console)
+    write_json_file(command.json, _report(plan, outcome, comparisons))
+    if outcome.stopped == "interrupted":
+        return 130
+    return 0 if outcome.complete else 1
+
+
+def _comparisons(plan: Plan, rows: list[dict[str, Any]]) -> tuple[list[Comparison], list[str]]:
+    """What the file asks to compare, as far as there are results, and why the rest is not."""
+    from sidestep.trials.campaign import compare
+
+    asked, found, without = plan.compare, [], []
+    for figure in asked.figures if asked is not None and rows else ():
+        assert asked is not None
+        try:
+            found.append(compare(rows, asked.by, figure, lower_is_better=figure in asked.lower_is_better))
+        except ValueError as error:
+            # A time to reach where nobody did, for example.
+            without.append(str(error))
+    return found, without
+
+
+def _report(plan: Plan, outcome: CampaignOutcome, comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    names = ("jobs", "done", "earlier", "ran", "damaged", "workers", "lost_workers", "stopped", "seconds")
+    return {
+        "campaign": plan.name,
+        "kind": plan.kind,
+        **{name: getattr(outcome, name) for name in names},
+        "failed": [
+            {"job": failure.job.id, **failure.job.labels, "reason": failure.reason}
+            for failure in outcome.failed
+        ],
+        "comparisons": [comparison.to_dict() for comparison in comparisons],
+    }
+
+
+def _say(
+    command: Campaign, folder: Path, outcome: CampaignOutcome, rows: list[dict[str, Any]], console: Console
+) -> None:
+    """What was done, what was not, and how to go on."""
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
+    say(
+        f"{outcome.done} of {outcome.jobs} jobs have a result: "
+        f"{outcome.ran} ran now, {outcome.earlier} before. Table: {folder / 'results.parquet'}"
+    )
+    if outcome.damaged:
+        say(f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
+    used = {row[f"version_{name}"] for row in rows for name in ("sidestep",)}
+    if len(used) > 1:
+        say(f"Results come from different versions of sidestep: {', '.join(sorted(used))}")
+    for failure in outcome.failed[:_FAILURES_SHOWN]:
+        labels = ", ".join(f"{name} {label}" for name, label in failure.job.labels.items())
+        say(f"Failed: {labels}: {failure.reason}")
+    if len(outcome.failed) > _FAILURES_SHOWN:
+        say(f"and {len(outcome.failed) - _FAILURES_SHOWN} more failed; --json lists all")
+    if outcome.complete:
+        return
+    words = ["sidestep", "campaign", str(command.file), "--out", str(folder)]
+    if command.scheduler != "local":
+        words += ["--scheduler", command.scheduler]
+    reason = "Jobs failed" if outcome.stopped is None else outcome.stopped[0].upper() + outcome.stopped[1:]
+    say(f"{reason}. What is done stays done; go on with: {shlex.join(words)}")
+
+
+def comparison_tables(comparisons: Sequence[Comparison]) -> list[Any]:
+    """For each figure the groups with their interquartile means, then the pairs."""
+    from rich.table import Table
+
+    tables = []
+    for comparison in comparisons:
+        title = comparison.figure.replace("_", " ") + (
+            " (less is better)" if comparison.lower_is_better else ""
+        )
+        table = Table("group", "runs", "interquartile mean", "95 % interval", title=title)
+        for group in comparison.groups:
+            estimate, low, high = group.interquartile_mean
+            # One run in a stratum leaves nothing to resample.
+            interval = f"{low:.4g} to {high:.4g}" if group.fewest > 1 else "-"
+            table.add_row(_words(group.labels), str(group.values), f"{estimate:.4g}", interval)
+        if comparison.left_out:
+            table.caption = f"{comparison.left_out} results without a value of it are left out"
+        tables.append(table)
+        if comparison.pairs:
+            pairs = Table("better", "than", "probability", "95 % interval", title=f"{title}, in pairs")
+            for pair in comparison.pairs:
+                chance, low, high = pair.probability
+                pairs.add_row(
+                    _words(pair.first), _words(pair.second), f"{chance:.1%}", f"{low:.1%} to {high:.1%}"
+                )
+            tables.append(pairs)
+    return tables
+
+
+def _words(labels: dict[str, Any]) -> str:
+    return ", ".join(str(label) for label in labels.values())
