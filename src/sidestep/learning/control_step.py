@@ -64,7 +64,13 @@ def decide(scenario: Scenario, policy: Callable[..., Any], world: World) -> Floa
             )
         return real(action)
 
-    action = lane_by_lane(ask, world.lanes, observe(scenario, world))
+    return nominal_velocity(scenario, world, lane_by_lane(ask, world.lanes, observe(scenario, world)))
+
+
+def nominal_velocity(
+    scenario: Scenario, world: World, action: Float[AnyArray, "2 *lanes"]
+) -> Float[Array, "2 *lanes"]:
+    """`to_velocity`, but NaN for an action that is not finite, which shields report as invalid input."""
     finite = jnp.isfinite(action[0]) & jnp.isfinite(action[1])
     return jnp.where(finite, to_velocity(scenario, world, action), jnp.nan)
 

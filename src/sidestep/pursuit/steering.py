@@ -3,14 +3,16 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Lanes
+from sidestep._arrays import AnyArray, Lanes, apart
 from sidestep.world.robots import wheels_from_body
 
 
 def bearing_of(z: Float[AnyArray, "2 *lanes"]) -> Lanes:
     """Direction (rad) of z, in [-pi, pi]; 0 at the origin, with a finite derivative there."""
-    apart = (z[0] != 0.0) | (z[1] != 0.0)
-    return jnp.arctan2(jnp.where(apart, z[1], 0.0), jnp.where(apart, z[0], 1.0))
+    somewhere = (z[0] != 0.0) | (z[1] != 0.0)
+    ahead, left = jnp.where(somewhere, z[0], 1.0), jnp.where(somewhere, z[1], 0.0)
+    # Slow, and asked for by either wheel.
+    return apart(jnp.arctan2, left, ahead) if left.ndim else jnp.arctan2(left, ahead)
 
 
 def nearer_end(bearing: Float[AnyArray, "*lanes"]) -> tuple[Lanes, Lanes]:

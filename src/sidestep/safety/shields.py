@@ -125,8 +125,9 @@ def decide(
     unless `enforced`. `known` says of each whether it speaks of finite numbers; None asks the world."""
     nominal = jnp.asarray(nominal, rows.values.dtype)
     known = _known(world) if known is None else known
-    known &= jnp.isfinite(rows.values) & jnp.isfinite(rows.offsets)
-    known &= _finite(rows.normals, 1)
+    known &= jnp.isfinite(rows.values)
+    if enforced:
+        known &= jnp.isfinite(rows.offsets) & _finite(rows.normals, 1)
     finite = _finite(nominal)
     everything = fold(jnp.logical_and, known, True)
     # With part of the world unknown nothing vouches for the nominal action.

@@ -7,7 +7,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Lanes, Scalar, fold, lane_by_lane, length, norm, real, stack
+from sidestep._arrays import (
+    AnyArray,
+    Flag,
+    Lanes,
+    Scalar,
+    apart,
+    fold,
+    lane_by_lane,
+    length,
+    norm,
+    real,
+    stack,
+)
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
 from sidestep.world.models import EvaderModel, EvaderState, PursuerModel, evader_of
@@ -189,7 +201,10 @@ class Scenario(eqx.Module):
         shape = (self.pursuer_count, *velocity.shape)
         wheels = jax.vmap(self.drivable)(jnp.reshape(wheel_speeds, shape))
         if self.evader_model is None:
-            to_pursuers, to_obstacles, to_target = self._approaches(world, velocity, wheels, period)
+            given = (self, world, velocity, wheels, period)
+            # Every event asks for them, and in lanes XLA would compute them anew for each.
+            least = apart(Scenario._approaches, *given) if world.lanes else Scenario._approaches(*given)
+            to_pursuers, to_obstacles, to_target = least
         else:
             # One program for all pieces: written out they take long to compile.
             to_pursuers, to_obstacles, to_target = jax.tree.map(

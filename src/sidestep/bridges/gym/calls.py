@@ -1,0 +1,117 @@
+"""Compiled programs that are called thousands of times a second: what may be flat, is."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sidestep._arrays import real
+from sidestep.bridges.gym.episode import Decision
+
+FLAGS = ("captured", "collided", "reached", "timed_out")
+_STATUSES = 4
+_PERIODS = _STATUSES * 2 ** len(FLAGS)
+
+
+class Bundle(NamedTuple):
+    """How a tree was laid out in one vector: its structure, and the shape of each leaf that is in there."""
+
+    structure: Any
+    shapes: tuple[tuple[int, ...] | None, ...]
+
+
+def bundle_of(tree: Any) -> Bundle:
+    """How `bundled` lays out a tree of arrays, or of their shapes."""
+    leaves, structure = jax.tree.flatten(tree)
+    default = real(0.0).dtype
+    return Bundle(structure, tuple(leaf.shape if leaf.dtype == default else None for leaf in leaves))
+
+
+def bundled(tree: Any) -> list[Any]:
+    """A tree as few arrays: its leaves of the default float type end to end in one, the rest as they are."""
+    leaves, shapes = jax.tree.leaves(tree), bundle_of(tree).shapes
+    inside = [jnp.ravel(leaf) for leaf, shape in zip(leaves, shapes, strict=True) if shape is not None]
+    rest = [leaf for leaf, shape in zip(leaves, shapes, strict=True) if shape is None]
+    return [jnp.concatenate([*inside, jnp.zeros(0, dtype=float)]), *rest]
+
+
+def unbundled(parts: list[Any], bundle: Bundle) -> Any:
+    """The tree again."""
+    (vector, *rest), begin, leaves = parts, 0, []
+    others = iter(rest)
+    for shape in bundle.shapes:
+        if shape is None:
+            leaves.append(next(others))
+            continue
+        end = begin + math.prod(shape)
+        leaves.append(jnp.reshape(vector[begin:end], shape))
+        begin = end
+    return jax.tree.unflatten(bundle.structure, leaves)
+
+
+@functools.lru_cache(maxsize=64)
+def flat(function: Callable[..., Any], *layouts: Any) -> Callable[..., Any]:
+    """`function(*trees, *arguments)` compiled, to be called with a list of arrays for each tree.
+
+    A layout is a `Bundle`, or the structure of a tree that is handed over leaf by leaf. JAX takes ten times
+    as long to look into a tree of modules, and a microsecond for every array. Two tasks of the same layout
+    get the same program.
+    """
+
+    @jax.jit
+    def program(parts: tuple[list[Any], ...], *arguments: Any) -> Any:
+        trees = [
+            unbundled(part, layout) if isinstance(layout, Bundle) else jax.tree.unflatten(layout, part)
+            for part, layout in zip(parts, layouts, strict=True)
+        ]
+        return function(*trees, *arguments)
+
+    return program
+
+
+def packed(made: Decision) -> tuple[Float[Array, "8 *lanes"], Int[Array, "*lanes"]]:
+    """A decision as two arrays: each array that crosses over to NumPy costs some microseconds."""
+    floats = jnp.stack(
+        [
+            made.reward,
+            made.intervention,
+            *made.proposed,
+            *made.executed,
+            made.pursuer_clearance,
+            made.obstacle_clearance,
+        ]
+    )
+    whole = made.status.astype(jnp.int32) * 2 ** len(FLAGS) + made.periods.astype(jnp.int32) * _PERIODS
+    for index, name in enumerate(FLAGS):
+        whole += getattr(made, name).astype(jnp.int32) * 2**index
+    return floats, whole
+
+
+def unpacked(floats: Any, whole: Any) -> tuple[Any, dict[str, Any]]:
+    """Reward and `info` of what `packed` made, each with an axis of lanes in front if there were any."""
+    floats, whole = np.asarray(floats), np.asarray(whole)
+    flags = {name: (whole & 2**index) != 0 for index, name in enumerate(FLAGS)}
+    return floats[0], {
+        "cost": (flags["captured"] | flags["collided"]).astype(np.float64),
+        **flags,
+        "status": whole // 2 ** len(FLAGS) % _STATUSES,
+        "periods": whole // _PERIODS,
+        "intervention": floats[1],
+        "proposed": np.moveaxis(floats[2:4], 0, -1),
+        "executed": np.moveaxis(floats[4:6], 0, -1),
+        "pursuer_clearance": floats[6],
+        "obstacle_clearance": floats[7],
+    }
+
+
+def seed_words(seeds: Any) -> np.ndarray:
+    """The words (2, n) of the random keys with these seeds: `jax.random.key(seed)`'s, below 2^32."""
+    seeds = [int(seed) % 2**64 for seed in seeds]
+    return np.array([[seed >> 32 for seed in seeds], [seed % 2**32 for seed in seeds]], np.uint32)

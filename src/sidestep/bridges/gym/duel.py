@@ -1,0 +1,276 @@
+"""Evader and pursuers as learners: a PettingZoo parallel environment."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import equinox as eqx
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from jaxtyping import Array, Float
+
+from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
+from sidestep.bridges.gym.rendering import Picture, check_render_mode
+from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
+from sidestep.bridges.gym.task import Task, make_task
+from sidestep.bridges.gym.worlds import given_world
+from sidestep.bridges.packages import needed
+from sidestep.world import Scenario, World
+from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.observation import NEAR_ROBOT
+
+pettingzoo = needed("pettingzoo", "gym", "the environment in which the pursuer learns needs")
+
+EVADER = "evader"
+_ROUNDING = 1e-5
+
+
+class _Told(eqx.Module):
+    """Pursuers that do as they are told."""
+
+    wheel_speeds: Float[Array, "m 2"]
+
+    def steer_all(self, scenario: Scenario, world: World) -> Float[Array, "m 2"]:
+        return self.wheel_speeds
+
+    def __call__(self, scenario: Scenario, world: World, key: Any) -> Float[Array, "2"]:
+        return self.wheel_speeds[0]
+
+
+def pursuer_observation(scenario: Scenario, world: World) -> Float[Array, "size"]:
+    """What `world.pursuer` sees, in its own frame (x ahead, y left), scaled to about [-1, 1].
+
+    Per robot: position squashed p/(1 + |p|) (2), a second vector (2) and exp(-c/0.2) for the clearance c (m).
+    First the evader, with its velocity over v_e, then each obstacle, with the same, then each other pursuer,
+    with its heading (cos, sin). The target's squashed position (2) comes last.
+    """
+    pose = world.pursuer
+
+    def turned(vector: Any) -> Any:
+        return to_pursuer_frame(vector, jnp.concatenate([jnp.zeros_like(pose[:2]), pose[2:]]))
+
+    def place(point: Any) -> Any:
+        z = to_pursuer_frame(point, pose)
+        return z / (1.0 + jnp.hypot(z[0], z[1]))
+
+    def block(point: Any, vector: Any, contact: Any) -> list[Any]:
+        gap = jnp.hypot(*(point - pose[:2])) - contact
+        return [place(point), turned(vector), jnp.exp(-jnp.maximum(gap, 0.0) / NEAR_ROBOT)[None]]
+
+    speed, capture = scenario.evader_speed, scenario.capture_distance
+    entries = block(world.evader, world.evader_velocity / speed, capture)
+    for obstacle in world.obstacles:
+        entries += block(obstacle[:2], obstacle[2:] / speed, scenario.collision_distance)
+    for other in world.pursuers[1:]:
+        entries += block(other[:2], jnp.stack([jnp.cos(other[2]), jnp.sin(other[2])]), capture)
+    return jnp.concatenate([*entries, place(world.target)]).astype(jnp.float32)
+
+
+def _pursuer_space(scenario: Scenario) -> spaces.Box:
+    drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity)) / np.asarray(scenario.evader_speed))
+    robot = [1.0] * 5
+    obstacle = [1.0, 1.0, max(1.0, drift), max(1.0, drift), 1.0]
+    bounds = [*robot, *obstacle * scenario.obstacle_count, *robot * (scenario.pursuer_count - 1), 1.0, 1.0]
+    high = np.array(bounds, np.float32) * np.float32(1.0 + _ROUNDING)
+    return spaces.Box(-high, high, dtype=np.float32)
+
+
+def _all_seen(task: Task, episode: Episode) -> tuple[Any, Any]:
+    views = [
+        pursuer_observation(task.scenario, episode.world.seen_by(index))
+        for index in range(task.scenario.pursuer_count)
+    ]
+    return seen(task, episode), jnp.stack(views)
+
+
+def _begin(task: Task, words: Any, number: Any) -> tuple[Any, ...]:
+    episode = begin(task, words, number)
+    return jax.tree.leaves(episode), *_all_seen(task, episode)
+
+
+def _begin_in(task: Task, world: World, words: Any, number: Any) -> tuple[Any, ...]:
+    episode = begin_in(task, world, words, number)
+    return jax.tree.leaves(episode), *_all_seen(task, episode)
+
+
+def _step(task: Task, episode: Episode, action: Any, wheels: Any) -> tuple[Any, ...]:
+    told = _Told(task.scenario.pursuer_speed * wheels)
+    episode, made = decide(eqx.tree_at(lambda task: task.pursuer, task, told), episode, action)
+    return jax.tree.leaves(episode), *_all_seen(task, episode), *packed(made)
+
+
+@final
+class DuelEnv(pettingzoo.ParallelEnv):
+    """The evader and its pursuers, all of them learners, acting at once.
+
+    **Agents:** `evader`, as in `PursuedEnv`, behind `shield` (or `"none"`); and `pursuer`, or `pursuer_0`,
+    `pursuer_1`, ... if there are several. Their action in [-1, 1]^2 is the left and right wheel's rim speed
+    over `pursuer_speed`; they see what `pursuer_observation` says.
+
+    **Rewards** add up to zero: the evader gets the scenario's, less `capture_penalty` (the scenario's
+    `reach_reward` unless given) for a capture or collision, times `reward_scale`; each of the m pursuers the
+    negative of it, over m. An evader chased into an obstacle is as good as caught.
+
+    Arguments and `info` are otherwise those of `PursuedEnv`; an episode ends for all agents at once.
+    """
+
+    # Each has its own, with its own pictures per second.
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "name": "sidestep_duel_v0",
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 20,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        scenario: Any = "paper",
+        shield: Any = "joint",
+        decision_steps: int = 10,
+        reward_scale: float = 1.0,
+        capture_penalty: float | None = None,
+        render_mode: str | None = None,
+        **fields: Any,
+    ):
+        self.render_mode = check_render_mode(render_mode)
+        self.task = make_task(scenario, shield, "still", decision_steps, reward_scale, **fields)
+        self.scenario = self.task.scenario
+        penalty = float(self.scenario.reach_reward) if capture_penalty is None else float(capture_penalty)
+        if not np.isfinite(penalty):
+            raise ValueError(f"capture_penalty = {capture_penalty!r}: it must be a finite number")
+        self._penalty = penalty * reward_scale
+        seconds = float(self.scenario.control_period) * self.task.decision_steps
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / seconds))}
+        count = self.scenario.pursuer_count
+        self.pursuers = ["pursuer"] if count == 1 else [f"pursuer_{index}" for index in range(count)]
+        self.possible_agents = [EVADER, *self.pursuers]
+        self.agents: list[str] = []
+        self.observation_spaces: dict[str, spaces.Box] = {
+            EVADER: observation_space(self.scenario),
+            **{agent: _pursuer_space(self.scenario) for agent in self.pursuers},
+        }
+        self.action_spaces = {agent: action_space() for agent in self.possible_agents}
+        self._task, self._layout = bundled(self.task), bundle_of(self.task)
+        shapes = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
+        example = jax.eval_shape(begin, self.task, *shapes)
+        self._inner = jax.tree.structure(example)
+        self._words, self._number = np.zeros(2, np.uint32), -1
+        self._episode: list[Any] | None = None
+        self._picture: Picture | None = None
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        return self.action_spaces[agent]
+
+    @property
+    def world(self) -> World:
+        """The world as it is now. **Raises** `gymnasium.error.ResetNeeded` before the first `reset`."""
+        if self._episode is None:
+            raise gymnasium.error.ResetNeeded("call reset() before anything else")
+        return jax.tree.unflatten(self._inner, self._episode).world
+
+    def state(self) -> np.ndarray:
+        """Positions, headings and velocities of everybody in world axes, for critics that see everything."""
+        world = self.world
+        parts = (world.evader, world.evader_velocity, world.pursuers, world.obstacles, world.target)
+        return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        if seed is not None or self._number < 0:
+            seed = seeding.np_random()[1] if seed is None else seed
+            self._words, self._number = seed_words([seed])[:, 0], -1
+        self._number += 1
+        number = np.asarray(self._number, np.int32)
+        if options and "world" in options:
+            leaves, structure = jax.tree.flatten(given_world(self.scenario, options["world"]))
+            made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
+        else:
+            made = flat(_begin, self._layout)((self._task,), self._words, number)
+        self._episode, observation, views = made
+        self.agents = list(self.possible_agents)
+        self._show(begun=True)
+        return self._told(observation, views), {agent: {} for agent in self.agents}
+
+    def _told(self, observation: Any, views: Any) -> dict[str, np.ndarray]:
+        return {EVADER: np.array(observation), **dict(zip(self.pursuers, np.array(views), strict=True))}
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        missing = [agent for agent in self.agents if agent not in actions]
+        if missing:
+            raise ValueError(f"no action for {', '.join(missing)}")
+        wheels = np.stack([checked_action(actions[agent], (2,)) for agent in self.pursuers])
+        assert self._episode is not None
+        program, told = flat(_step, self._layout, self._inner), checked_action(actions[EVADER], (2,))
+        made = program((self._task, self._episode), told, wheels)
+        self._episode, observation, views, floats, whole = made
+        reward, info = unpacked(floats, whole)
+        info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}
+        gained = float(reward) - self._penalty * info["cost"]
+        truncated = info["timed_out"]
+        terminated = any(info[name] for name in FLAGS) and not truncated
+        everybody = self.agents
+        shares = {agent: -gained / len(self.pursuers) for agent in self.pursuers}
+        self._show(info=info)
+        if terminated or truncated:
+            self.agents = []
+        return (
+            self._told(observation, views),
+            {EVADER: gained, **shares},
+            dict.fromkeys(everybody, terminated),
+            dict.fromkeys(everybody, truncated),
+            {agent: dict(info) for agent in everybody},
+        )
+
+    def _show(self, *, begun: bool = False, info: dict[str, Any] | None = None) -> None:
+        if self.render_mode is None:
+            return
+        if self._picture is None:
+            self._picture = Picture(self.scenario, self.task.shield)
+        if begun:
+            self._picture.clear()
+        self._picture.follow(self.world, info)
+        if self.render_mode == "human":
+            self._picture.show(self.metadata["render_fps"])
+
+    def render(self) -> np.ndarray | None:
+        """The scene as pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""
+        if self._picture is None or self.render_mode != "rgb_array":
+            return None
+        return self._picture.drawn()
+
+    def close(self) -> None:
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+
+ID = "sidestep/Duel-v0"
+
+
+def parallel_env(**arguments: Any) -> DuelEnv:
+    """A `DuelEnv`, by the name that PettingZoo's modules give it."""
+    return DuelEnv(**arguments)
+
+
+def env(**arguments: Any) -> Any:
+    """The same with one agent acting after the other, as PettingZoo's AEC environments do."""
+    from pettingzoo.utils import wrappers
+    from pettingzoo.utils.conversions import parallel_to_aec
+
+    return wrappers.OrderEnforcingWrapper(parallel_to_aec(DuelEnv(**arguments)))
+
+
+if ID not in pettingzoo.parallel_registry:
+    pettingzoo.register("parallel", ID, entry_point=f"{__name__}:parallel_env")
+    pettingzoo.register("aec", ID, entry_point=f"{__name__}:env")

@@ -1,0 +1,177 @@
+"""One world as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, final
+
+import gymnasium
+import jax
+import numpy as np
+
+from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
+from sidestep.bridges.gym.rendering import Picture, check_render_mode
+from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
+from sidestep.bridges.gym.task import Task, make_task
+from sidestep.bridges.gym.worlds import given_world
+from sidestep.world import World
+
+
+def _begin(task: Task, words: Any, number: Any) -> tuple[list[Any], Any]:
+    episode = begin(task, words, number)
+    return jax.tree.leaves(episode), seen(task, episode)
+
+
+def _begin_in(task: Task, world: World, words: Any, number: Any) -> tuple[list[Any], Any]:
+    episode = begin_in(task, world, words, number)
+    return jax.tree.leaves(episode), seen(task, episode)
+
+
+def _step(task: Task, episode: Episode, action: Any) -> tuple[list[Any], Any, Any, Any]:
+    episode, made = decide(task, episode, action)
+    return jax.tree.leaves(episode), seen(task, episode), *packed(made)
+
+
+@final
+class PursuedEnv(gymnasium.Env):
+    """`sidestep/Pursued-v0`: reach the target while somebody hunts you, with a shield that keeps you free.
+
+    Arguments are those of `make_task`: `scenario` (with its fields by name), `shield`, `pursuer`,
+    `decision_steps` control periods per step, `reward_scale`; and `render_mode`.
+
+    - The observation is the scenario's (`sidestep.observe`), the action the wished velocity over the evader's
+      speed, in the same axes.
+    - `terminated` is true when captured, collided or at the target, `truncated` when the scenario's
+      `episode_steps` control periods are over.
+    - The reward is the scenario's, summed over the step's control periods, times `reward_scale`.
+    - `info` has `cost` (1.0 for a capture or collision), the flags `captured`, `collided`, `reached` and
+      `timed_out`, the shield's worst `status` of the step and its mean `intervention` (m/s), the action
+      `proposed` and the mean one `executed`, the least `pursuer_clearance` and `obstacle_clearance` (m), and
+      the control `periods` lived through.
+    - `reset(seed=s)` begins episode 0 of `sidestep.evaluate(..., key=s)`, each further `reset()` the next.
+      `reset(options={"world": ...})` starts in a given `World`, or in a mapping of its parts.
+    """
+
+    # Each has its own, with its own pictures per second.
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: Any = "paper",
+        shield: Any = "joint",
+        pursuer: Any = "nash",
+        decision_steps: int = 10,
+        reward_scale: float = 1.0,
+        render_mode: str | None = None,
+        **fields: Any,
+    ):
+        self.render_mode = check_render_mode(render_mode)
+        self.task = make_task(scenario, shield, pursuer, decision_steps, reward_scale, **fields)
+        self.scenario = self.task.scenario
+        seconds = float(self.scenario.control_period) * self.task.decision_steps
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / seconds))}
+        self.observation_space = observation_space(self.scenario)
+        self.action_space = action_space()
+        self._words, self._number = np.zeros(2, np.uint32), -1
+        self._episode: list[Any] | None = None
+        self._over = True
+        self._picture: Picture | None = None
+        self._compile()
+
+    def _compile(self) -> None:
+        self._task, self._layout = bundled(self.task), bundle_of(self.task)
+        shapes = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
+        example = jax.eval_shape(begin, self.task, *shapes)
+        self._inner = jax.tree.structure(example)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in ("_task", "_layout", "_inner", "_picture")
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._picture = None
+        self._compile()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PursuedEnv:
+        twin = type(self).__new__(type(self))
+        memo[id(self)] = twin
+        # Arrays never change, so the two may share them.
+        shared = {name: self.__getstate__()[name] for name in ("task", "scenario", "_episode")}
+        rest = {name: value for name, value in self.__getstate__().items() if name not in shared}
+        twin.__setstate__({**copy.deepcopy(rest, memo), **shared})
+        return twin
+
+    @property
+    def world(self) -> World:
+        """The world as it is now. **Raises** `gymnasium.error.ResetNeeded` before the first `reset`."""
+        return jax.tree.unflatten(self._inner, self._now()).world
+
+    def _now(self) -> list[Any]:
+        if self._episode is None:
+            raise gymnasium.error.ResetNeeded("call reset() before anything else")
+        return self._episode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        if seed is not None or self._number < 0:
+            self._words, self._number = seed_words([self.np_random_seed])[:, 0], -1
+        self._number += 1
+        number = np.asarray(self._number, np.int32)
+        if options and "world" in options:
+            world = given_world(self.scenario, options["world"])
+            leaves, structure = jax.tree.flatten(world)
+            made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
+        else:
+            made = flat(_begin, self._layout)((self._task,), self._words, number)
+        self._episode, observation = made
+        self._over = False
+        self._show(begun=True)
+        return np.array(observation), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self._over:
+            raise gymnasium.error.ResetNeeded("the episode is over, or has not begun: call reset()")
+        program = flat(_step, self._layout, self._inner)
+        made = program((self._task, self._now()), checked_action(action, (2,)))
+        self._episode, observation, floats, whole = made
+        reward, info = unpacked(floats, whole)
+        # Plain numbers, as Gymnasium's own environments give them; arrays of their own.
+        info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}
+        truncated = info["timed_out"]
+        terminated = any(info[name] for name in FLAGS) and not truncated
+        self._over = terminated or truncated
+        self._show(info=info)
+        return np.array(observation), float(reward), terminated, truncated, info
+
+    def _show(self, *, begun: bool = False, info: dict[str, Any] | None = None) -> None:
+        """Keep what a picture needs; with `human`, show it."""
+        if self.render_mode is None:
+            return
+        if self._picture is None:
+            self._picture = Picture(self.scenario, self.task.shield)
+        if begun:
+            self._picture.clear()
+        self._picture.follow(self.world, info)
+        if self.render_mode == "human":
+            self._picture.show(self.metadata["render_fps"])
+
+    def render(self) -> np.ndarray | None:
+        """The scene as an array of pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() shows nothing without a render_mode: give one to gymnasium.make")
+            return None
+        self._now()
+        assert self._picture is not None
+        return self._picture.drawn() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None

@@ -1,0 +1,66 @@
+"""What is to be learned: scenario, shield, pursuer, and for how long an action is held."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from sidestep._arrays import Scalar, real
+from sidestep.pursuit import as_pursuer
+from sidestep.safety import as_shield
+from sidestep.world import Scenario, load_scenario
+
+
+class Task(eqx.Module):
+    """One learning problem. Its numbers are traced: tasks that differ in them share their compiled programs.
+
+    **Attributes:** `scenario`; `shield`; `pursuer`; `reward_scale` by which the scenario's reward is
+    multiplied; `decision_steps` control periods for which an action is held.
+    """
+
+    scenario: Scenario
+    shield: Any
+    pursuer: Any
+    reward_scale: Scalar
+    decision_steps: int = eqx.field(static=True)
+
+
+def make_task(
+    scenario: Any = "paper",
+    shield: Any = "joint",
+    pursuer: Any = "nash",
+    decision_steps: int = 10,
+    reward_scale: float = 1.0,
+    **fields: Any,
+) -> Task:
+    """A task from what the environments take.
+
+    **Arguments:** `scenario` a preset, a file or a `Scenario`; `shield` a name or a `Shield`; `pursuer` a
+    name, a `Pursuer` or a callable `(scenario, world, key) -> wheel speeds`; `fields` of the scenario by
+    name, unless it is a `Scenario` already.
+
+    **Raises** `ValueError` (`ScenarioError` for fields) naming what is wrong and what is allowed.
+    """
+    if isinstance(scenario, Scenario):
+        if fields:
+            names = ", ".join(sorted(fields))
+            raise ValueError(f"fields ({names}) go with a scenario's name or file, not with a Scenario")
+    else:
+        scenario = load_scenario(scenario, **fields)
+    if (
+        isinstance(decision_steps, bool)
+        or not isinstance(decision_steps, (int, np.integer))
+        or decision_steps < 1
+    ):
+        raise ValueError(f"decision_steps = {decision_steps!r}: it must be a whole number of at least 1")
+    if not np.isfinite(reward_scale):
+        raise ValueError(f"reward_scale = {reward_scale!r}: it must be a finite number")
+    return Task(
+        scenario=scenario,
+        shield=as_shield(shield, scenario),
+        pursuer=as_pursuer(pursuer),
+        reward_scale=real(reward_scale),
+        decision_steps=int(decision_steps),
+    )

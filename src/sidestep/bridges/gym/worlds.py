@@ -1,0 +1,47 @@
+"""Worlds that `reset` is asked to start in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.world import Scenario, World
+
+_PARTS = ("evader", "pursuers", "obstacles", "target")
+
+
+def given_world(scenario: Scenario, given: Any, lanes: tuple[int, ...] = ()) -> World:
+    """The world of `options={"world": ...}`: a `World`, or a mapping of `evader` (2,), `pursuers` (m, 3),
+    `obstacles` (k, 4) and `target` (2,), each with an axis of worlds in front if there are several. It starts
+    at time 0.
+
+    **Returns** it in lanes if there are several. **Raises** `ValueError` naming the part that is missing,
+    has the wrong shape or is not finite.
+    """
+    if not isinstance(given, (World, Mapping)):
+        raise ValueError(f"options['world'] must be a World or a mapping, not a {type(given).__name__}")
+    shapes = {
+        "evader": (2,),
+        "pursuers": (scenario.pursuer_count, 3),
+        "obstacles": (scenario.obstacle_count, 4),
+        "target": (2,),
+    }
+    parts: dict[str, np.ndarray] = {}
+    for name in _PARTS:
+        value: Any = getattr(given, name) if isinstance(given, World) else given.get(name)
+        if value is None:
+            raise ValueError(f"options['world'] has no {name!r}; it needs {', '.join(_PARTS)}")
+        parts[name] = np.asarray(value, np.float64)
+        wanted = (*lanes, *shapes[name])
+        if parts[name].shape != wanted or not np.all(np.isfinite(parts[name])):
+            raise ValueError(
+                f"options['world']: {name!r} must be {wanted} finite numbers, not {parts[name].shape}"
+            )
+    if not lanes:
+        return World(**parts)
+    worlds = jax.vmap(World)(**{name: jnp.asarray(part, dtype=float) for name, part in parts.items()})
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), worlds)
