@@ -12,7 +12,7 @@
 - `joint`: the shield `joint` with one obstacle and the untrained policy that heads for the target, or a run
   folder's; 20,000 episodes of at most 120 s against `nash`, 5,000 against every other pursuer.
 - `three-obstacles`: the same with three obstacles, 5,000 episodes against `nash`.
-- `2-pursuers-game`, `2-pursuers-joint`, and so with 3: several `nash` at once, no obstacle, 500 episodes each.
+- `2-pursuers-game`, `2-pursuers-joint`, and so with 3: several `nash` at once, no obstacle, 500 each.
 
 Work is done in blocks, each with a random key of its own (the same for every pursuer and policy: `fold_in` of
 the seed with the block's number), and written down block by block: a run that was interrupted goes on where

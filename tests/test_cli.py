@@ -174,6 +174,7 @@ def test_training_of_a_campaign_is_the_run_and_goes_on_where_it_was_left(run, tm
     assert (folder / "policy.npz").is_file()
 
 
+@pytest.mark.slow
 def test_report_of_a_run_needs_no_network(run, monkeypatch):
     out, _ = run
     assert main(["report", str(out), "--episodes", "2"]) == 0

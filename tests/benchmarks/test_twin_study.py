@@ -18,6 +18,7 @@ def study():
     return module
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_goes_on_where_it_stopped(study, tmp_path, monkeypatch, capsys):
     out, whole_block, calls = tmp_path / "twin.json", study.run_block, []
 

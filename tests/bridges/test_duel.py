@@ -101,6 +101,7 @@ def test_a_pursuer_sees_the_same_wherever_the_scene_lies():
     np.testing.assert_allclose(first["pursuer"][-2:], (1.7 / 2.7, 0.0), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_several_pursuers_share_what_the_evader_loses_and_each_has_its_own_wheels():
     env = duel.parallel_env(
         **{**TASK, "decision_steps": 1, "scenario": load_scenario("paper", pursuer_count=2)}

@@ -257,6 +257,7 @@ def test_alone_a_robot_decides_as_it_does_in_a_batch(decided):
         np.testing.assert_array_equal(kept.way, memory.way[index])
 
 
+@pytest.mark.slow
 def test_far_away_and_without_obstacles_it_is_the_game_shield():
     for count, obstacle in ((0, None), (1, [[5.0, 5.0]])):
         scenario = load_scenario(
