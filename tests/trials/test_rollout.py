@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.trials import load_episode, load_trajectory, rollout, save_trajectory
-from sidestep.world import load_scenario, scenario_to_dict
+from sidestep.world import EvaderModel, EvaderState, load_scenario, scenario_to_dict
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +109,24 @@ def test_recording_in_double_precision(scenario):
         wide = rollout(load_scenario("paper-test"), "goal-seeking", "game", "turn-then-drive", 0, steps=40)
         assert wide.worlds.evader.dtype == np.float64
         assert np.all(np.isfinite(wide.worlds.evader))
+
+
+class Obedient(EvaderModel):
+    """Moves as told, and counts how often it was."""
+
+    def start(self, scenario, key):
+        return jnp.zeros(1)
+
+    def after(self, scenario, robot, command, time):
+        return EvaderState(robot.position + command * time, command, robot.state + time)
+
+
+def test_episode_of_a_robot_of_ones_own_is_read_back_without_its_code(tmp_path):
+    own = load_scenario("paper", evader_model=Obedient(), episode_steps=4)
+    whole = rollout(own, "goal-seeking", "none", "still", 0)
+    save_trajectory(tmp_path / "own.npz", whole, own)
+    back = load_episode(tmp_path / "own.npz")
+    assert back.scenario.built_in
+    assert back.scenario.episode_steps == 4
+    np.testing.assert_array_equal(back.trajectory.worlds.evader_state, whole.worlds.evader_state)
+    np.testing.assert_allclose(whole.worlds.evader_state[:, 0], 0.05 * np.arange(5), atol=1e-6)

@@ -24,6 +24,7 @@ from sidestep.safety import Shield, as_shield
 from sidestep.trials.keys import as_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
 from sidestep.world import Events, Scenario, World, load_scenario, scenario_to_dict
+from sidestep.world.state import worlds_of
 
 _TOLD = "told"
 
@@ -195,21 +196,20 @@ def load_trajectory(path: str | Path) -> Trajectory:
 
 def load_episode(path: str | Path) -> Episode:
     """What `save_trajectory` wrote, with what it was told. **Raises** as `load_trajectory`."""
-    place = jnp.zeros(2)
-    example = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place)
     try:
         with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
             arrays = {name: jnp.asarray(archive[name]) for name in archive.files if name != _TOLD}
             told = json.loads(bytes(archive[_TOLD])) if _TOLD in archive.files else {}
-        leaves = [arrays.pop(f"worlds.{name}") for name in _named_leaves(example)]
-        worlds = jax.tree.unflatten(jax.tree.structure(example), leaves)
+        places = {name: arrays.pop(name) for name in list(arrays) if name.startswith("worlds.")}
         events = {name: arrays.pop(name) for name in list(arrays) if name.startswith("events.")}
         trajectory = Trajectory(
-            worlds=worlds,
+            worlds=worlds_of({name.removeprefix("worlds."): values for name, values in places.items()}),
             events=Events(**{name.removeprefix("events."): values for name, values in events.items()}),
             **arrays,
         )
-        scenario = load_scenario("paper", **told["scenario"]) if told else None
+        # Robots of one's own are code, and what was recorded needs none of it.
+        built_in = {"evader_model": None, "pursuer_model": None}
+        scenario = load_scenario("paper", **told["scenario"] | built_in) if told else None
         return Episode(trajectory, scenario, told.get("about", {}))
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} holds no recorded trajectory: {error}") from error

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sidestep._arrays import AnyArray, Scalar, real
+
+WORLD_FIELDS = ("evader", "pursuers", "obstacles", "target", "time", "evader_velocity", "wheel_speeds")
+"""What every world has, by name."""
 
 
 class World(eqx.Module):
@@ -87,3 +93,12 @@ class World(eqx.Module):
             self,
             (self.pursuers.at[:, 0].add(off), self.obstacles.at[:, 0].add(off)),
         )
+
+
+def worlds_of(parts: Mapping[str, AnyArray]) -> World:
+    """Many worlds in one, from arrays with the same leading axes, by the names of `WORLD_FIELDS`, and
+    `evader_state` where there is one. `World` itself is made for a single one."""
+    place, own = jnp.zeros(2), "evader_state" in parts
+    one = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place, evader_state=place if own else None)
+    names = (*WORLD_FIELDS, "evader_state") if own else WORLD_FIELDS
+    return jax.tree.unflatten(jax.tree.structure(one), [jnp.asarray(parts[name]) for name in names])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from sidestep.bridges.logs.writer import LogWriter
 from sidestep.safety import Status
 from sidestep.trials import Trajectory
 from sidestep.world import Events, Scenario, World, load_scenario
+from sidestep.world.state import WORLD_FIELDS, worlds_of
 
 _EVENTS = (
     "reward", "captured", "collided", "reached", "timed_out", "pursuer_clearance", "obstacle_clearance",
@@ -86,15 +87,7 @@ def save_log(
 
 
 def _host(worlds: World) -> dict[str, np.ndarray]:
-    return {field.name: np.asarray(getattr(worlds, field.name)) for field in fields(World)}
-
-
-def _series(worlds: Mapping[str, np.ndarray]) -> World:
-    """Worlds with a leading axis of instants; `World` itself is made for one."""
-    place = jnp.zeros(2)
-    example = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place)
-    leaves = [jnp.asarray(worlds[field.name]) for field in fields(World)]
-    return jax.tree.unflatten(jax.tree.structure(example), leaves)
+    return {name: np.asarray(getattr(worlds, name)) for name in WORLD_FIELDS}
 
 
 def _write_world(log: LogWriter, stamp: float, world: Mapping[str, np.ndarray]) -> None:
@@ -136,7 +129,7 @@ def load_log(path: str | Path, scenario: Scenario | None = None) -> Log:
         rebuilt.append("nominal velocities: those that were driven")
         nominal = action
     trajectory = Trajectory(
-        worlds=_series(worlds),
+        worlds=worlds_of(worlds),
         nominal=jnp.asarray(nominal),
         action=jnp.asarray(action),
         wheel_speeds=jnp.asarray(_asked(scenario, record, times[:-1], worlds)),

@@ -24,9 +24,9 @@ from sidestep.trials.falsification.attackers import Script
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.trials.rollout import Trajectory, rollout
 from sidestep.world import Scenario, World, load_scenario, scenario_to_dict
+from sidestep.world.state import WORLD_FIELDS
 
 _FORMAT = 1
-_WORLD = ("evader", "pursuers", "obstacles", "target", "time", "evader_velocity", "wheel_speeds")
 _NEEDED = (
     "scenario", "shield", "policy", "seed", "attack", "version", "dtype", "limit", "outcome", "steps",
     "time", "pursuer_clearance", "obstacle_clearance", "assumption", "words", "guaranteed_clearance",
@@ -139,7 +139,7 @@ def write_counterexample(path: str | Path, counterexample: Counterexample) -> No
     arrays = {
         "about": np.frombuffer(text.encode(), np.uint8),
         "wheels": counterexample.wheels,
-        **{f"start_{name}": np.asarray(getattr(counterexample.world, name)) for name in _WORLD},
+        **{f"start_{name}": np.asarray(getattr(counterexample.world, name)) for name in WORLD_FIELDS},
         **{f"end_{name}": value for name, value in counterexample.end.items()},
     }
     write_arrays(Path(path), arrays)
@@ -163,7 +163,7 @@ def read_counterexample(path: str | Path) -> Counterexample:
         if missing:
             raise CounterexampleError(f"{path} does not say {', '.join(missing)}")
         with jax.enable_x64(about["dtype"] == "float64"):
-            world = World(**{name: jnp.asarray(arrays[f"start_{name}"]) for name in _WORLD})
+            world = World(**{name: jnp.asarray(arrays[f"start_{name}"]) for name in WORLD_FIELDS})
         world = jax.tree.map(np.asarray, world)
         end = {name: arrays[f"end_{name}"] for name in ("evader", "pursuers")}
         return Counterexample(about, world, arrays["wheels"], end)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any, final
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sidestep.trials import Trajectory
 from sidestep.views.play.layout import Layout
 from sidestep.views.play.program import EVENTS
-from sidestep.world import Events, World
+from sidestep.world import Events
+from sidestep.world.state import worlds_of
 
 _FLAGS = ("captured", "collided", "reached", "timed_out")
 _TAKEN = ("nominal", "action", "barriers", "slack", "intervention")
@@ -61,15 +60,10 @@ class Recording:
             raise ValueError("nothing has been recorded yet")
         first, told = self._place.split(begun), self._told.split(said)
         parts = {name: np.concatenate([first[name], told[name][-1:]]) for name in self._place.shapes}
-        # Many worlds in one: made as a tree, since `World` itself is of one.
-        place = jnp.zeros(2)
-        one = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place)
-        names = [field.name for field in fields(World)]
-        worlds = jax.tree.unflatten(jax.tree.structure(one), [jnp.asarray(parts[name]) for name in names])
         flags = {name: jnp.asarray(told[name] > 0.5) for name in _FLAGS}
         rest = {name: jnp.asarray(told[name]) for name in EVENTS if name not in _FLAGS}
         return Trajectory(
-            worlds=worlds,
+            worlds=worlds_of(parts),
             wheel_speeds=jnp.asarray(told["wheels"]),
             status=jnp.asarray(told["status"].astype(np.int32)),
             events=Events(**flags, **rest),
