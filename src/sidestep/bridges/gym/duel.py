@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
-from sidestep.bridges.gym.rendering import Picture, check_render_mode
+from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
 from sidestep.bridges.gym.worlds import given_world
@@ -161,7 +161,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
         self._inner = jax.tree.structure(example)
         self._words, self._number = np.zeros(2, np.uint32), -1
         self._episode: list[Any] | None = None
-        self._picture: Picture | None = None
+        self._screen = Screen(self.render_mode, self.scenario, self.task.shield, self.metadata["render_fps"])
 
     def observation_space(self, agent: str) -> spaces.Box:
         return self.observation_spaces[agent]
@@ -197,7 +197,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
             made = flat(_begin, self._layout)((self._task,), self._words, number)
         self._episode, observation, views = made
         self.agents = list(self.possible_agents)
-        self._show(begun=True)
+        self._screen.follow(lambda: self.world, begun=True)
         return self._told(observation, views), {agent: {} for agent in self.agents}
 
     def _told(self, observation: Any, views: Any) -> dict[str, np.ndarray]:
@@ -221,7 +221,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
         terminated = any(info[name] for name in FLAGS) and not truncated
         everybody = self.agents
         shares = {agent: -gained / len(self.pursuers) for agent in self.pursuers}
-        self._show(info=info)
+        self._screen.follow(lambda: self.world, info)
         if terminated or truncated:
             self.agents = []
         return (
@@ -232,27 +232,12 @@ class DuelEnv(pettingzoo.ParallelEnv):
             {agent: dict(info) for agent in everybody},
         )
 
-    def _show(self, *, begun: bool = False, info: dict[str, Any] | None = None) -> None:
-        if self.render_mode is None:
-            return
-        if self._picture is None:
-            self._picture = Picture(self.scenario, self.task.shield)
-        if begun:
-            self._picture.clear()
-        self._picture.follow(self.world, info)
-        if self.render_mode == "human":
-            self._picture.show(self.metadata["render_fps"])
-
     def render(self) -> np.ndarray | None:
         """The scene as pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""
-        if self._picture is None or self.render_mode != "rgb_array":
-            return None
-        return self._picture.drawn()
+        return self._screen.pixels()
 
     def close(self) -> None:
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        self._screen.close()
 
 
 ID = "sidestep/Duel-v0"

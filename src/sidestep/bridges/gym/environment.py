@@ -11,7 +11,7 @@ import numpy as np
 
 from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
-from sidestep.bridges.gym.rendering import Picture, check_render_mode
+from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
 from sidestep.bridges.gym.worlds import given_world
@@ -76,7 +76,6 @@ class PursuedEnv(gymnasium.Env):
         self._words, self._number = np.zeros(2, np.uint32), -1
         self._episode: list[Any] | None = None
         self._over = True
-        self._picture: Picture | None = None
         self._compile()
 
     def _compile(self) -> None:
@@ -84,17 +83,17 @@ class PursuedEnv(gymnasium.Env):
         shapes = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
         example = jax.eval_shape(begin, self.task, *shapes)
         self._inner = jax.tree.structure(example)
+        self._screen = Screen(self.render_mode, self.scenario, self.task.shield, self.metadata["render_fps"])
 
     def __getstate__(self) -> dict[str, Any]:
         return {
             name: value
             for name, value in self.__dict__.items()
-            if name not in ("_task", "_layout", "_inner", "_picture")
+            if name not in ("_task", "_layout", "_inner", "_screen")
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._picture = None
         self._compile()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> PursuedEnv:
@@ -132,7 +131,7 @@ class PursuedEnv(gymnasium.Env):
             made = flat(_begin, self._layout)((self._task,), self._words, number)
         self._episode, observation = made
         self._over = False
-        self._show(begun=True)
+        self._screen.follow(lambda: self.world, begun=True)
         return np.array(observation), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -147,20 +146,8 @@ class PursuedEnv(gymnasium.Env):
         truncated = info["timed_out"]
         terminated = any(info[name] for name in FLAGS) and not truncated
         self._over = terminated or truncated
-        self._show(info=info)
+        self._screen.follow(lambda: self.world, info)
         return np.array(observation), float(reward), terminated, truncated, info
-
-    def _show(self, *, begun: bool = False, info: dict[str, Any] | None = None) -> None:
-        """Keep what a picture needs; with `human`, show it."""
-        if self.render_mode is None:
-            return
-        if self._picture is None:
-            self._picture = Picture(self.scenario, self.task.shield)
-        if begun:
-            self._picture.clear()
-        self._picture.follow(self.world, info)
-        if self.render_mode == "human":
-            self._picture.show(self.metadata["render_fps"])
 
     def render(self) -> np.ndarray | None:
         """The scene as an array of pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""
@@ -168,10 +155,7 @@ class PursuedEnv(gymnasium.Env):
             gymnasium.logger.warn("render() shows nothing without a render_mode: give one to gymnasium.make")
             return None
         self._now()
-        assert self._picture is not None
-        return self._picture.drawn() if self.render_mode == "rgb_array" else None
+        return self._screen.pixels()
 
     def close(self) -> None:
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        self._screen.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -153,3 +154,37 @@ class Picture:
             self._words.set_animated(True)
             self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(figure.bbox)
+
+
+@final
+class Screen:
+    """What an environment shows of its episode as it goes, by its render mode; nothing without one."""
+
+    def __init__(self, mode: str | None, scenario: Scenario, shield: Any, rate: int):
+        self._mode, self._about, self._rate = mode, (scenario, shield), rate
+        self._picture: Picture | None = None
+
+    def follow(
+        self, world: Callable[[], World], info: dict[str, Any] | None = None, *, begun: bool = False
+    ) -> None:
+        """Keep what a picture needs of `world()`, the first of an episode if it has `begun`; with `human`,
+        show it."""
+        if self._mode is None:
+            return
+        if self._picture is None:
+            self._picture = Picture(*self._about)
+        if begun:
+            self._picture.clear()
+        self._picture.follow(world(), info)
+        if self._mode == "human":
+            self._picture.show(self._rate)
+
+    def pixels(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """The picture with `rgb_array`, once there is something to see; else None."""
+        return self._picture.drawn() if self._picture is not None and self._mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
