@@ -6,6 +6,7 @@ import os
 import pickle
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -21,7 +22,16 @@ from sidestep.bridges.gym import ID, PursuedEnv, PursuedVectorEnv, SafetyGymnasi
 from sidestep.bridges.gym.calls import seed_words
 from sidestep.safety import Status, make_shield
 from sidestep.trials import evaluate
-from sidestep.world import World, goal_seeking, load_scenario, scenario_to_dict, to_action, to_velocity
+from sidestep.world import (
+    EvaderModel,
+    EvaderState,
+    World,
+    goal_seeking,
+    load_scenario,
+    scenario_to_dict,
+    to_action,
+    to_velocity,
+)
 
 HOLD, LIMIT = 3, 120
 # One scenario for all: tasks of one structure share their compiled programs.
@@ -340,3 +350,33 @@ def test_safety_gymnasium_gets_its_cost_third():
     foreign.reset()
     with pytest.raises(KeyError, match="cost"):
         foreign.step(AHEAD)
+
+
+class Lag(EvaderModel):
+    """Runs up to what it is told; its constant is a plain number, as anyone would write it."""
+
+    seconds: float = 0.05
+
+    def after(self, scenario, robot, command, time):
+        left, excess = jnp.exp(-time / self.seconds), robot.velocity - command
+        place = robot.position + command * time + excess * self.seconds * (1.0 - left)
+        return EvaderState(place, command + excess * left, robot.state)
+
+    def control_point(self, scenario, robot):
+        return robot.position + self.seconds * robot.velocity
+
+    def offset(self, scenario):
+        return self.seconds * scenario.evader_speed
+
+
+def test_a_robot_of_ones_own_drives_in_the_environment_as_in_the_scenario():
+    own = load_scenario("paper", evader_model=Lag(), capture_distance=0.15)
+    env = gymnasium.make(ID, scenario=own, shield="none", pursuer="still", decision_steps=1).unwrapped
+    env.reset(seed=0)
+    before = env.world
+    env.step(np.array([1.0, 0.0], np.float32))
+    speed = float(jnp.linalg.norm(env.world.evader_velocity))
+    assert speed == pytest.approx(0.1574 * (1.0 - np.exp(-1.0)), rel=1e-4)
+    assert float(jnp.linalg.norm(env.world.evader - before.evader)) == pytest.approx(
+        0.1574 * 0.05 * np.exp(-1.0), rel=1e-3
+    )

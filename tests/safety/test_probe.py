@@ -124,6 +124,15 @@ class _WrongUnits(_Steady):
         return 1000.0 * normal, 1000.0 * rate
 
 
+class _Reversed(_Steady):
+    def value(self, scenario, evader, robot, memory):
+        return -super().value(scenario, evader, robot, memory)
+
+    def approach(self, scenario, evader, robot, memory):
+        normal, rate = super().approach(scenario, evader, robot, memory)
+        return -normal, -rate
+
+
 class _Vector(_Steady):
     def value(self, scenario, evader, robot, memory):
         return evader - robot[:2]
@@ -152,7 +161,8 @@ class _OneRobot(_Steady):
         (_TurnedNormal(), "the normal is not the gradient"),
         (_NoHold(), r"relative degree above 1"),
         (_NotFinite(), r"h, .*not finite, for instance with the evader at"),
-        (_WrongUnits(), "Is it in metres"),
+        (_WrongUnits(), "h is above 0 at 100% of the places in contact"),
+        (_Reversed(), "is its sign turned round"),
         (_Vector(), r"value\(scenario, evader, robot, memory\) must give one number.*\(2,\)"),
         (_NoRate(), r"must give \(normal \(2,\), rate \(\)\)"),
         (_Typo(), r"allowance\(scenario, h\) raised AttributeError"),

@@ -24,6 +24,8 @@ _KINKS = 0.05
 _VANISHED = 1e-3
 _NEAR = 0.1
 """A barrier's row must be kept where it matters: at values up to this share of the contact distance."""
+_INSIDE = 0.9
+"""Share of the contact distance within which there is no doubt that there is contact."""
 _FEW = 0.001
 """Share of places that may be rounding."""
 
@@ -141,9 +143,10 @@ def probe_barrier(barrier: Barrier, scenario: Scenario) -> BarrierProbe:
     """Look at a barrier at 2048 places around another robot, up to three contact distances away.
 
     It is none (`errors`) if its answers have wrong shapes or are not finite, if alpha(0) is not 0 or alpha
-    does not increase (class K through zero), if the normal is not dh/dp_e, or if that vanishes: then the
-    evader's velocity has no hold on h (relative degree above 1). It guarantees nothing (`doubts`) if the
-    other robot can lower h faster than the rate, or where the row asks of the evader more than it has.
+    does not increase (class K through zero), if h is above 0 in contact, if the normal is not dh/dp_e, or if
+    that vanishes: then the evader's velocity has no hold on h (relative degree above 1). It guarantees
+    nothing (`doubts`) if the other robot can lower h faster than the rate, or where the row asks of the
+    evader more than it has.
     """
     world = _sample_world(scenario)
     errors = _shape_errors(barrier, scenario, world)
@@ -199,6 +202,14 @@ def _judge(
             f"is {seen['normal'][at].round(3).tolist()}, the gradient is "
             f"{seen['gradient'][at].round(3).tolist()} (in world axes)"
         )
+    inside = np.linalg.norm(places, axis=1) < _INSIDE * contact
+    free = float(np.mean(seen["h"][inside] > 0.0))
+    if free > 0.5:
+        errors.append(
+            f"h is above 0 at {free:.0%} of the places in contact, where all is lost: is its sign turned "
+            "round? It must be at least 0 where the evader is free"
+        )
+        return errors, [], 0.0, 0.0
     near = (seen["h"] >= 0.0) & (seen["h"] <= _NEAR * contact)
     if not np.any(near):
         errors.append(

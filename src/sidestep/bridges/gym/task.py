@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from sidestep._arrays import Scalar, real
@@ -57,10 +58,12 @@ def make_task(
         raise ValueError(f"decision_steps = {decision_steps!r}: it must be a whole number of at least 1")
     if not np.isfinite(reward_scale):
         raise ValueError(f"reward_scale = {reward_scale!r}: it must be a finite number")
-    return Task(
+    task = Task(
         scenario=scenario,
         shield=as_shield(shield, scenario),
         pursuer=as_pursuer(pursuer),
         reward_scale=real(reward_scale),
         decision_steps=int(decision_steps),
     )
+    # A model of one's own may hold plain numbers.
+    return jax.tree.map(lambda leaf: real(leaf) if isinstance(leaf, (int, float)) else leaf, task)
