@@ -44,6 +44,11 @@ def lane_by_lane(function: Callable[..., Any], lanes: int, *arguments: Any) -> A
     return function(*arguments)
 
 
+def select(flags: Bool[Array, "..."], if_true: Any, if_false: Any) -> Any:
+    """The one pytree where `flags`, which its leaves may have more axes in front of, else the other."""
+    return jax.tree.map(lambda a, b: jnp.where(flags, a, b), if_true, if_false)
+
+
 def fold(operation: Callable[[Any, Any], Any], parts: Array, initial: float | bool) -> Array:
     """A ufunc such as `jnp.minimum` over the first axis; `initial`, its neutral element, if that is empty.
 

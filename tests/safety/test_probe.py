@@ -35,10 +35,8 @@ from sidestep.safety import (
 from sidestep.world import PursuerModel, World, load_scenario
 from sidestep.world.robots import wheels_from_body
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 # What users are shown is what is tested.
-
-
+EXAMPLES = Path(__file__).parents[2] / "examples"
 Car = runpy.run_path(str(EXAMPLES / "car_pursuer.py"))["Car"]
 Unicycle = runpy.run_path(str(EXAMPLES / "unicycle_evader.py"))["Unicycle"]
 

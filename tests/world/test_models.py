@@ -25,10 +25,8 @@ from sidestep.world import (
 )
 from sidestep.world.robots import body_velocity
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 # What users are shown is what is tested.
-
-
+EXAMPLES = Path(__file__).parents[2] / "examples"
 Accelerating = runpy.run_path(str(EXAMPLES / "accelerating_evader.py"))["Accelerating"]
 Unicycle = runpy.run_path(str(EXAMPLES / "unicycle_evader.py"))["Unicycle"]
 Car = runpy.run_path(str(EXAMPLES / "car_pursuer.py"))["Car"]

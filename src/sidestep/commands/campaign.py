@@ -44,7 +44,7 @@ class Campaign:
 
 def run(command: Campaign, console: Console) -> int:
     """Run `sidestep campaign`; returns the exit status: 1 when a job failed or the scheduler was lost."""
-    from sidestep.trials.campaign import Store, campaign_rows, load_campaign
+    from sidestep.trials.campaign import Store, load_campaign
 
     plan = load_campaign(command.file)
     folder = command.out or Path("runs") / command.file.stem
@@ -59,13 +59,12 @@ def run(command: Campaign, console: Console) -> int:
             plan, folder, scheduler=command.scheduler, workers=command.workers,
             threads_per_worker=command.threads_per_worker, progress=show,
         )  # fmt: skip
-    rows = campaign_rows(plan.jobs, Store(folder))
-    comparisons, without = _comparisons(plan, rows)
+    comparisons, without = _comparisons(plan, outcome.rows)
     for table in comparison_tables(comparisons):
         console.print(table)
     for words in without:
         console.print(f"Not compared: {words}", highlight=False, soft_wrap=True)
-    _say(command, folder, outcome, rows, console)
+    _say(command, folder, outcome, console)
     write_json_file(command.json, _report(plan, outcome, comparisons))
     if outcome.stopped == "interrupted":
         return 130
@@ -101,9 +100,7 @@ def _report(plan: Plan, outcome: CampaignOutcome, comparisons: Sequence[Comparis
     }
 
 
-def _say(
-    command: Campaign, folder: Path, outcome: CampaignOutcome, rows: list[dict[str, Any]], console: Console
-) -> None:
+def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Console) -> None:
     """What was done, what was not, and how to go on."""
 
     def say(text: str) -> None:
@@ -115,7 +112,7 @@ def _say(
     )
     if outcome.damaged:
         say(f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
-    used = {row[f"version_{name}"] for row in rows for name in ("sidestep",)}
+    used = {row["version_sidestep"] for row in outcome.rows}
     if len(used) > 1:
         say(f"Results come from different versions of sidestep: {', '.join(sorted(used))}")
     for failure in outcome.failed[:_FAILURES_SHOWN]:

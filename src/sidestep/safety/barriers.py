@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sidestep._arrays import AnyArray, Lanes, Scalar, length, real, stack
+from sidestep._arrays import AnyArray, Lanes, Scalar, length, real, select, stack
 from sidestep.pursuit.game import CaptureGame, turning_moment
 from sidestep.safety.budget import Budget
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -314,7 +314,7 @@ class PursuitBarrier(Barrier):
                 # However steep alpha is, one period must not spend more than there is.
                 allowed = jnp.minimum(self.allowance(scenario, h), jnp.abs(h) / time)
                 row = (normal, sunk / time - allowed)
-                return h, *jax.tree.map(lambda a, b: jnp.where(known, a, b), row, tuple(worst))
+                return h, *select(known, row, tuple(worst))
 
             return jax.vmap(after)(real((0.5, 1.0)))
 

@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 
 from sidestep._arrays import Scalar, real
 from sidestep.safety.frame_barrier import FrameBarrier, pursuer_corners
+from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.robots import drive, wheels_from_body
 from sidestep.world.scenario import Scenario
 
 _HEADINGS = 24
@@ -84,13 +86,12 @@ def _edges(corners: np.ndarray) -> np.ndarray:
     return np.unique(np.concatenate([a + shares * (b - a) for a, b in pairs] or [corners]), axis=0)
 
 
-def _seen_after(nodes: Array, speed: Scalar, turn_rate: Scalar, period: Scalar) -> Array:
+def _seen_after(nodes: Float[Array, "n 2"], motion: Float[Array, "2"], period: Scalar) -> Array:
     """Where `nodes` are in the frame of a pursuer that has driven an arc."""
-    half = turn_rate * period / 2.0
-    chord = speed * period * jnp.sinc(half / jnp.pi)
-    x, y = nodes[..., 0] - chord * jnp.cos(half), nodes[..., 1] - chord * jnp.sin(half)
-    cosine, sine = jnp.cos(2.0 * half), jnp.sin(2.0 * half)
-    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
+    axle = jnp.ones_like(period)
+    wheels = wheels_from_body(motion[0], motion[1], axle)
+    pose = drive(jnp.zeros_like(motion, shape=3), wheels, axle, period)
+    return jax.vmap(to_pursuer_frame, in_axes=(0, None))(nodes, pose)
 
 
 @eqx.filter_jit
@@ -123,7 +124,7 @@ def _sweeps(
 
     def pursuer_best(values: Array) -> Array:
         def least(best: Array, motion: Array) -> tuple[Array, None]:
-            return jnp.minimum(best, at(values, _seen_after(nodes, motion[0], motion[1], period))), None
+            return jnp.minimum(best, at(values, _seen_after(nodes, motion, period))), None
 
         return jax.lax.scan(least, values.reshape(-1), motions)[0].reshape(count, count)
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Scalar, norm, real
+from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, select
 from sidestep.pursuit import Pursuer, make_pursuer, pursue
 from sidestep.safety.budget import Budget
 from sidestep.safety.by_need import by_need
@@ -168,7 +168,7 @@ class JointShield(Shield):
             evasive,
             (jnp.maximum(evasive.status, Status.CORRECTED), norm(evasive.action - wanted)),
         )
-        result = jax.tree.map(lambda a, b: jnp.where(decision.accept, a, b), greedy, evasive)
+        result = select(decision.accept, greedy, evasive)
         return result, JointMemory(
             jnp.where(decision.accept, sides, evasive_sides),
             decision.way,
@@ -208,11 +208,7 @@ class JointShield(Shield):
         is counted on, whether the one that is followed still comes to no contact."""
         now, memory = situation.world, situation.memory
         after = [
-            jax.tree.map(
-                lambda a, b: jnp.where(memory.counts, a, b),
-                self.scenario.step(now, situation.action, wheels)[0],
-                now,
-            )
+            select(memory.counts, self.scenario.step(now, situation.action, wheels)[0], now)
             for wheels in situation.wheels
         ]
         worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1)[..., None], *after)

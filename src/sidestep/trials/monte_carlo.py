@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Count
+from sidestep._arrays import Count, select
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, Status, as_shield, start_in_lanes
@@ -73,7 +73,7 @@ def _begin(shield: Any, numbers: Int[Array, "batch"], worlds: World) -> Episode:
 @eqx.filter_jit
 def _refill(shield: Any, slots: Episode, numbers: Int[Array, "batch"], worlds: World) -> Episode:
     """Slot i becomes episode `numbers[i]` at its start, unless that is negative."""
-    return _select(numbers >= 0, _begin(shield, numbers, worlds), slots)
+    return select(numbers >= 0, _begin(shield, numbers, worlds), slots)
 
 
 def _empty_slots(shield: Any, worlds: World, size: int) -> Episode:
@@ -81,10 +81,6 @@ def _empty_slots(shield: Any, worlds: World, size: int) -> Episode:
     numbers = jnp.full(size, RUNNING, jnp.int32)
     shapes = eqx.filter_eval_shape(_begin, shield, numbers, worlds)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-
-def _select(flags: Array, if_true: Any, if_false: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(flags, a, b), if_true, if_false)
 
 
 @eqx.filter_jit
@@ -129,7 +125,7 @@ def _advance(
             correction=episode.correction + result.intervention,
             max_correction=jnp.maximum(episode.max_correction, result.intervention),
         )
-        return _select(running, moved, episode), sums
+        return select(running, moved, episode), sums
 
     def decision(episode: Episode, sums: Sums) -> tuple[Episode, Sums]:
         nominal = decide(scenario, policy, episode.world)

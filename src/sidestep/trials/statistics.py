@@ -112,9 +112,10 @@ def probability_of_improvement(
     **Raises** `ValueError` when the two differ in their number of strata, and as `stratified_bootstrap` does.
     """
     _check_level(level)
-    pairs = list(zip(_strata(first), _strata(second), strict=False))
+    groups = _strata(first), _strata(second)
     if len(first) != len(second):
         raise ValueError(f"{len(first)} strata cannot be compared with {len(second)}: give the same to both")
+    pairs = list(zip(*groups, strict=True))
     generator = np.random.default_rng(seed)
     estimate, draws = 0.0, np.zeros(resamples)
     for x, y in pairs:

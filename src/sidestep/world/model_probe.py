@@ -190,8 +190,7 @@ def check_models(scenario: Scenario) -> list[str]:
             warnings.warn(
                 f"{name}: its control point moves up to {seen.tracking_error:.3g} m/s otherwise than told. "
                 f"Shields allow for that with Budget(tracking_error={seen.tracking_error:.2g}), if the game "
-                "leaves room; "
-                "or choose a point that follows",
+                "leaves room; or choose a point that follows",
                 ModelWarning,
                 stacklevel=4,
             )

@@ -33,7 +33,8 @@ class EvaderModel(eqx.Module):
     told, what is guaranteed for an omnidirectional evader is guaranteed for this robot. `probe_evader`
     measures whether it does.
 
-    Functions see one robot, no batch. Constants may be fields: they are traced.
+    Functions see one robot, no batch. Numbers may be fields; as JAX arrays they are traced, as plain ones
+    another value compiles anew.
     """
 
     def start(self, scenario: Scenario, key: PRNGKeyArray) -> Float[Array, "s"]:
@@ -62,7 +63,7 @@ class PursuerModel(eqx.Module):
     it can take. Strategies answer in wheel speeds all the same, v -+ b omega with the scenario's half axle b
     (`sidestep.world.robots.wheels_from_body`), so that every strategy can be tried on every pursuer.
 
-    Constants may be fields: they are traced.
+    Numbers may be fields, as in `EvaderModel`.
     """
 
     @abc.abstractmethod

@@ -40,7 +40,7 @@ class CampaignOutcome:
     **Attributes:** `jobs` asked for; `earlier` of them were there already; `ran` ended with a result now;
     `failed` did not; `damaged` result files were set aside since the folder was begun; `lost_workers` were
     there and then not; `stopped` is why it ended before its end, None if it did not; `seconds` from the first
-    worker to the last result.
+    worker to the last result; `rows` as `campaign_rows` makes them of all results.
     """
 
     jobs: int
@@ -52,6 +52,7 @@ class CampaignOutcome:
     workers: int = 0
     stopped: str | None = None
     seconds: float = 0.0
+    rows: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def done(self) -> int:
@@ -116,10 +117,10 @@ def run_campaign(
         finally:
             outcome.seconds = time.monotonic() - begun
             outcome.damaged = store.damaged()
-            rows = campaign_rows(campaign.jobs, store)
+            outcome.rows = campaign_rows(campaign.jobs, store)
             # Also what workers put there after the command had lost them.
-            outcome.ran = len(rows) - outcome.earlier
-            write_table(store.folder / "results.parquet", rows)
+            outcome.ran = len(outcome.rows) - outcome.earlier
+            write_table(store.folder / "results.parquet", outcome.rows)
     return outcome
 
 

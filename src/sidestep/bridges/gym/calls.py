@@ -111,6 +111,16 @@ def unpacked(floats: Any, whole: Any) -> tuple[Any, dict[str, Any]]:
     }
 
 
+def unpacked_one(floats: Any, whole: Any) -> tuple[float, bool, bool, dict[str, Any]]:
+    """Of one episode: reward, whether it is terminated, whether truncated, and `info` of plain numbers, as
+    Gymnasium's own environments give them, and arrays of its own."""
+    reward, info = unpacked(floats, whole)
+    info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}
+    truncated = info["timed_out"]
+    terminated = any(info[name] for name in FLAGS) and not truncated
+    return float(reward), terminated, truncated, info
+
+
 def seed_words(seeds: Any) -> np.ndarray:
     """The words (2, n) of the random keys with these seeds: `jax.random.key(seed)`'s, below 2^32."""
     seeds = [int(seed) % 2**64 for seed in seeds]

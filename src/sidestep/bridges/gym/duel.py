@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from jaxtyping import Array, Float
 
-from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
@@ -144,8 +144,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
         if not np.isfinite(penalty):
             raise ValueError(f"capture_penalty = {capture_penalty!r}: it must be a finite number")
         self._penalty = penalty * reward_scale
-        seconds = float(self.scenario.control_period) * self.task.decision_steps
-        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / seconds))}
+        self.metadata = {**type(self).metadata, "render_fps": self.task.pictures_per_second}
         count = self.scenario.pursuer_count
         self.pursuers = ["pursuer"] if count == 1 else [f"pursuer_{index}" for index in range(count)]
         self.possible_agents = [EVADER, *self.pursuers]
@@ -214,11 +213,8 @@ class DuelEnv(pettingzoo.ParallelEnv):
         program, told = flat(_step, self._layout, self._inner), checked_action(actions[EVADER], (2,))
         made = program((self._task, self._episode), told, wheels)
         self._episode, observation, views, floats, whole = made
-        reward, info = unpacked(floats, whole)
-        info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}
-        gained = float(reward) - self._penalty * info["cost"]
-        truncated = info["timed_out"]
-        terminated = any(info[name] for name in FLAGS) and not truncated
+        reward, terminated, truncated, info = unpacked_one(floats, whole)
+        gained = reward - self._penalty * info["cost"]
         everybody = self.agents
         shares = {agent: -gained / len(self.pursuers) for agent in self.pursuers}
         self._screen.follow(lambda: self.world, info)

@@ -9,7 +9,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from sidestep.bridges.gym.calls import FLAGS, bundle_of, bundled, flat, packed, seed_words, unpacked
+from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
@@ -69,8 +69,7 @@ class PursuedEnv(gymnasium.Env):
         self.render_mode = check_render_mode(render_mode)
         self.task = make_task(scenario, shield, pursuer, decision_steps, reward_scale, **fields)
         self.scenario = self.task.scenario
-        seconds = float(self.scenario.control_period) * self.task.decision_steps
-        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / seconds))}
+        self.metadata = {**type(self).metadata, "render_fps": self.task.pictures_per_second}
         self.observation_space = observation_space(self.scenario)
         self.action_space = action_space()
         self._words, self._number = np.zeros(2, np.uint32), -1
@@ -140,14 +139,10 @@ class PursuedEnv(gymnasium.Env):
         program = flat(_step, self._layout, self._inner)
         made = program((self._task, self._now()), checked_action(action, (2,)))
         self._episode, observation, floats, whole = made
-        reward, info = unpacked(floats, whole)
-        # Plain numbers, as Gymnasium's own environments give them; arrays of their own.
-        info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}
-        truncated = info["timed_out"]
-        terminated = any(info[name] for name in FLAGS) and not truncated
+        reward, terminated, truncated, info = unpacked_one(floats, whole)
         self._over = terminated or truncated
         self._screen.follow(lambda: self.world, info)
-        return np.array(observation), float(reward), terminated, truncated, info
+        return np.array(observation), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """The scene as an array of pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from sidestep._arrays import AnyArray, Lanes, lane_by_lane, real
+from sidestep._arrays import AnyArray, Lanes, lane_by_lane, real, select
 from sidestep.bridges.gym.task import Task
 from sidestep.learning.control_step import control_step, nominal_velocity
 from sidestep.safety import start_in_lanes
@@ -145,11 +145,6 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
         made,
         (made.intervention / count, to_action(scenario, start, made.executed / count)),
     )
-
-
-def select(flags: Bool[Array, "*lanes"], if_true: Any, if_false: Any) -> Any:
-    """Lane by lane the one pytree or the other."""
-    return jax.tree.map(lambda a, b: jnp.where(flags, a, b), if_true, if_false)
 
 
 def seen(task: Task, episode: Episode) -> Float[Array, "*lanes observation"]:

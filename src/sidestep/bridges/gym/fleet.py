@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from sidestep._arrays import AnyArray
-from sidestep.bridges.gym.episode import Decision, Episode, begin, begin_in, decide, seen, select
+from sidestep._arrays import AnyArray, select
+from sidestep.bridges.gym.episode import Decision, Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.task import Task
 from sidestep.world import World
 

@@ -27,6 +27,11 @@ class Task(eqx.Module):
     reward_scale: Scalar
     decision_steps: int = eqx.field(static=True)
 
+    @property
+    def pictures_per_second(self) -> int:
+        """At which a picture per decision plays as fast as it happened; at least 1."""
+        return max(1, round(1.0 / (float(self.scenario.control_period) * self.decision_steps)))
+
 
 def make_task(
     scenario: Any = "paper",

@@ -99,10 +99,9 @@ class PursuedVectorEnv(VectorEnv):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.task = make_task(scenario, shield, pursuer, decision_steps, reward_scale, **fields)
         self.scenario = self.task.scenario
-        seconds = float(self.scenario.control_period) * self.task.decision_steps
         self.metadata = {
             **type(self).metadata,
-            "render_fps": max(1, round(1.0 / seconds)),
+            "render_fps": self.task.pictures_per_second,
             "autoreset_mode": self.autoreset_mode,
         }
         self.single_observation_space = observation_space(self.scenario)

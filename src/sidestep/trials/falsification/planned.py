@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arrays import Count
+from sidestep._arrays import Count, select
 from sidestep.learning.control_step import RUNNING
 from sidestep.trials.falsification.attackers import script
 from sidestep.trials.falsification.chases import Chase, Target, begin, forget, run, shortfall
@@ -82,7 +82,7 @@ def search_starts(
 
     def start_of(base: World, vector: Array) -> World:
         moved = decode(scenario, base, vector)
-        return jax.tree.map(lambda a, b: jnp.where(jnp.any(freedom > 0.0), a, b), moved, base)
+        return select(jnp.any(freedom > 0.0), moved, base)
 
     def evaluate(drawn: Array) -> Array:
         worlds = jax.vmap(start_of)(_spread(bases, drawn.shape[0] // count), drawn[:, :entries])

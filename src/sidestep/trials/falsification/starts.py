@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, norm, real
+from sidestep._arrays import AnyArray, Flag, norm, real, select
 from sidestep.pursuit.steering import bearing_of
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
@@ -147,7 +147,7 @@ def draw_starts(scenario: Scenario, keys: Key[Array, "n"], edge: AnyArray) -> Wo
     def draw(key: PRNGKeyArray, edge: Array) -> World:
         base_key, edge_key = jax.random.split(key)
         base = scenario.reset(base_key)
-        return jax.tree.map(lambda a, b: jnp.where(edge, a, b), at_edge(scenario, base, edge_key), base)
+        return select(edge, at_edge(scenario, base, edge_key), base)
 
     return jax.vmap(draw)(keys, jnp.asarray(edge))
 
