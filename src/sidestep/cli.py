@@ -17,6 +17,7 @@ from sidestep.commands import (
     evaluate,
     export,
     falsify,
+    fly,
     play,
     report,
     reproduce,
@@ -35,6 +36,7 @@ _RUN: dict[type, Callable[..., int]] = {
     campaign.Campaign: campaign.run,
     export.Export: export.run,
     twin.Twin: twin.run,
+    fly.Fly: fly.run,
     bench.Bench: bench.run,
 }
 
@@ -52,6 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[campaign.Campaign, subcommand("campaign")]
         | Annotated[export.Export, subcommand("export")]
         | Annotated[twin.Twin, subcommand("twin")]
+        | Annotated[fly.Fly, subcommand("fly")]
         | Annotated[bench.Bench, subcommand("bench")],
         prog="sidestep",
         description="Safe reinforcement learning for a robot that is being pursued.",

@@ -19,7 +19,7 @@ from sidestep.bridges.twin import (
     twin_episode,
     write_video,
 )
-from sidestep.bridges.twin.episode import _events
+from sidestep.bridges.twin.record import events_of
 from sidestep.cli import main
 from sidestep.safety import Status
 from sidestep.trials import load_trajectory, rollout, save_trajectory
@@ -125,10 +125,10 @@ def test_time_runs_out_only_where_nothing_else_has_happened(chased):
     world = rollout_end(chased)
     for captured, reached in ((False, False), (True, False), (False, True)):
         contacts = Contacts(0.3, 0.3, 0.01, captured, False, reached)
-        events = _events(ROOMY, world, contacts, last=True)
+        events = events_of(ROOMY, world, contacts, last=True)
         assert events["timed_out"] == (not captured and not reached)
         assert (events["reward"] == 1000.0) == reached
-        assert not _events(ROOMY, world, contacts, last=False)["timed_out"]
+        assert not events_of(ROOMY, world, contacts, last=False)["timed_out"]
 
 
 def rollout_end(episode) -> World:

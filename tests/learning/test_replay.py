@@ -14,7 +14,17 @@ from sidestep.learning.training import run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.safety.status import Status
-from sidestep.world import World, load_scenario, observation_names, observe, to_action, to_velocity
+from sidestep.world import (
+    EvaderModel,
+    EvaderState,
+    Quadrotor,
+    World,
+    load_scenario,
+    observation_names,
+    observe,
+    to_action,
+    to_velocity,
+)
 
 REACH, COST = 0.25, 0.01
 
@@ -245,6 +255,58 @@ def test_mirrored_rows_are_the_same_rows_seen_in_a_mirror():
     for worlds, seen in zip(half_worlds, (half.observation, half.next_observation), strict=True):
         np.testing.assert_allclose(look(worlds), seen, atol=1e-6)
         np.testing.assert_array_equal(np.asarray(worlds.evader)[:, 1] < 0.0, flipped & (worlds.time > 0))
+
+
+class Secretive(EvaderModel):
+    """Obeys at once, keeps a number, and says nothing of mirrors."""
+
+    def start(self, scenario, key):
+        return jnp.ones(1)
+
+    def after(self, scenario, robot, command, time):
+        return EvaderState(robot.position + command * time, command, robot.state)
+
+
+@pytest.mark.parametrize("model", [Quadrotor(), Secretive()], ids=["quadrotor", "knows no mirror"])
+def test_robots_of_ones_own_are_mirrored_with_what_they_keep_or_not_at_all(model):
+    scenario = load_scenario("quadrotor", evader_model=model, obstacle_count=1)
+    reset = eqx.filter_jit(scenario.reset)
+    kept = 2 if isinstance(model, Quadrotor) else 1
+    worlds = [
+        eqx.tree_at(lambda w: w.evader_state, reset(jax.random.key(n)), real([0.3, 0.7 + n])[:kept])
+        for n in range(4)
+    ]
+    replay = Replay.init(own_transition(worlds[0]), CAPACITY)
+    for world in worlds:
+        replay = add(replay, own_transition(world), jnp.asarray(0), jnp.asarray(True))
+    numbers = jax.random.key(5), 64, real(0.0)
+    (plain, before, _), (image, mirrored, _) = (
+        _draw(scenario, replay, *numbers, real(share), False, real(0.0), real(1.0)) for share in (0.0, 1.0)
+    )
+    flip = np.array([1.0, -1.0]) if isinstance(model, Quadrotor) else 1.0
+    np.testing.assert_array_equal(mirrored.evader, before.evader * flip)
+    np.testing.assert_array_equal(mirrored.evader_state, before.evader_state * flip)
+    np.testing.assert_allclose(image.action, plain.action * flip, atol=1e-6)
+    assert len(np.unique(before.evader_state, axis=0)) == (4 if isinstance(model, Quadrotor) else 1)
+
+
+def own_transition(world):
+    return Transition(
+        world=world, next_world=world, path=jnp.stack([world.evader] * (PERIODS + 1)),
+        steps=jnp.asarray(PERIODS, int), proposed=real([0.1, 0.2]), executed=real([0.1, 0.2]),
+        correction=real(0.0), lost=jnp.asarray(False),
+    )  # fmt: skip
+
+
+def test_mirrored_quadrotor_moves_as_the_mirror_of_it(x64):
+    scenario = load_scenario("quadrotor")
+    step = jax.jit(lambda world, action, wheels: scenario.step(world, action, wheels)[0])
+    mirror = jax.jit(lambda world: mirror_world(world, scenario.evader_model))
+    world, action, wheels = scenario.reset(jax.random.key(1)), real([0.3, 0.6]), real([[0.7, 1.2]])
+    moved = step(step(world, action, wheels), action, wheels)
+    image = step(mirror(step(world, action, wheels)), action * real([1.0, -1.0]), wheels[:, ::-1])
+    assert np.abs(moved.evader_state).min() > 0.1
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), mirror(moved), image)
 
 
 def random_worlds(count, seed):

@@ -99,7 +99,8 @@ def test_every_error_is_a_value_error():
 
 def test_unknown_scenario_lists_the_presets():
     with pytest.raises(
-        ScenarioError, match=r"no scenario 'papr': neither a preset \(paper, paper-test\) nor a file"
+        ScenarioError,
+        match=r"no scenario 'papr': neither a preset \(paper, paper-test, quadrotor, quadrotor-test\) nor",
     ):
         load_scenario("papr")
 
@@ -155,7 +156,7 @@ def test_fewer_robots_than_fixed_starts_keeps_the_first():
 
 
 def test_presets_hold_the_papers_numbers(precision):
-    for name in PRESETS:
+    for name in ("paper", "paper-test"):
         scenario = load_scenario(name)
         assert scenario.name == name
         values = scenario_to_dict(scenario)
@@ -182,7 +183,7 @@ CHANGED = {
 def assert_same(one, two):
     assert jax.tree.structure(one) == jax.tree.structure(two)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
-        assert a.dtype == b.dtype
+        assert np.asarray(a).dtype == np.asarray(b).dtype
         np.testing.assert_array_equal(a, b)
 
 

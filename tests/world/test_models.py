@@ -243,7 +243,7 @@ def test_pursuer_that_can_do_more_than_its_model_says_is_refused(model, words):
 
 @pytest.mark.parametrize("value", ["Unicycle(ahead=0.02)", 3.0, Car()], ids=["text", "number", "pursuer"])
 def test_model_that_is_none_says_that_it_is_code(value):
-    with pytest.raises(ScenarioError, match=r"must be a EvaderModel.*It is code"):
+    with pytest.raises(ScenarioError, match=r"must be a EvaderModel.*is code"):
         load_scenario("paper", evader_model=value)
 
 

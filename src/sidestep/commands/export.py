@@ -64,6 +64,10 @@ def run(command: Export, console: Console) -> int:
             f"an ONNX graph holds the rows of the shield 'game', not '{name}'; leave out --shield, or use "
             "--format jax"
         )
+    if command.what != "policy":
+        from sidestep.bridges.export import ALONE
+
+        scenario.check_built_in("an exported filter", ALONE)
     names = ("position_error", "heading_error", "delay", "tracking_error")
     errors = {error: getattr(command, error) for error in names}
     shield = make_shield(name, scenario, Budget(**errors) if any(errors.values()) else None)
@@ -72,8 +76,8 @@ def run(command: Export, console: Console) -> int:
     if command.format == "onnx":
         from sidestep.bridges.export import export_onnx
 
-        assert isinstance(shield, GameShield)
-        about = export_onnx(command.out, scenario, policy, shield=shield, **options)
+        game = shield if isinstance(shield, GameShield) else None
+        about = export_onnx(command.out, scenario, policy, shield=game, **options)
     else:
         from sidestep.bridges.export import export_jax
 

@@ -27,11 +27,12 @@ class Train:
     out: Path
     """Run folder to write; never overwritten silently."""
     scenario: ScenarioName = "paper"
-    """Preset (paper, paper-test) or a TOML or JSON file."""
+    """Preset (paper, paper-test, quadrotor, quadrotor-test) or a TOML or JSON file."""
     shield: ShieldName = "joint"
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = "nash"
-    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still."""
+    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; for what
+    cannot turn on the spot chauffeur."""
     episodes: int = 200
     """Episodes to train for; with --resume the new total."""
     seed: int = 0

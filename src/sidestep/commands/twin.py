@@ -89,6 +89,7 @@ def run(command: Twin, console: Console) -> int:
     if command.log is not None and command.log.exists():
         raise ValueError(f"{command.log} exists already; give the log another name")
     scenario = load_scenario(command.scenario, **parse_overrides(command.set))
+    scenario.check_built_in("the twin", "`sidestep fly` flies a quadrotor")
     policy: Any = command.run if command.run == "goal-seeking" else load_policy(command.run)
     options = TwinOptions(
         base=command.base,
@@ -125,7 +126,7 @@ def run(command: Twin, console: Console) -> int:
     assert first is not None
     for text in dict.fromkeys(str(one.message) for one in warned):
         console.print(f"Warning: {text}.", highlight=False)
-    _print(figures, console)
+    episode_table(figures, "episodes on the twin", console)
     write_json_file(command.json, _report(command, scenario, options, settings, figures))
     if interrupted:
         console.print(f"Interrupted: {len(figures)} of {command.seeds} episodes.", highlight=False)
@@ -206,7 +207,8 @@ def twin_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
     return counts
 
 
-def _print(figures: list[dict[str, Any]], console: Console) -> None:
+def episode_table(figures: list[dict[str, Any]], what: str, console: Console) -> None:
+    """A line for every episode, and the counts of all with 95 % bounds."""
     from rich.table import Table
 
     counts = twin_counts(figures)
@@ -224,7 +226,7 @@ def _print(figures: list[dict[str, Any]], console: Console) -> None:
             f"seed {figure['seed']}: {outcome} after {figure['duration']:.2f} s{''.join(least)}",
             highlight=False,
         )
-    table = Table("outcome", "episodes", "95 % bounds", title=f"{counts['episodes']} episodes on the twin")
+    table = Table("outcome", "episodes", "95 % bounds", title=f"{counts['episodes']} {what}")
     for name in ("captured", "collided", "reached", "timed_out", "cut"):
         if name == "cut" and not counts["cut"]:
             continue

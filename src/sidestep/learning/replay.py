@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Flag, Scalar, real
 from sidestep.learning.td3 import Batch
-from sidestep.world import Scenario, World, observe, to_action
+from sidestep.world import EvaderModel, Scenario, World, observe, to_action
 from sidestep.world.robots import closest_approach_straight
 
 
@@ -113,11 +113,14 @@ def _reflect(vectors: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
     return vectors * jnp.array([1.0, -1.0], vectors.dtype)
 
 
-def mirror_world(world: World) -> World:
-    """The world reflected in its x axis: left and right swap, headings change sign.
+def mirror_world(world: World, model: EvaderModel | None = None) -> World:
+    """The world reflected in its x axis: left and right swap, headings change sign; `model` mirrors what it
+    keeps of the evader, or else that stays as it is.
 
     The robots do not tell left from right, so a transition's mirror image is as true as itself.
     """
+    state = world.evader_state
+    mirrored = None if model is None or state is None else model.mirrored(state)
     obstacles = world.obstacles * jnp.array([1.0, -1.0, 1.0, -1.0], world.obstacles.dtype)
     return World(
         evader=_reflect(world.evader),
@@ -127,7 +130,14 @@ def mirror_world(world: World) -> World:
         time=world.time,
         evader_velocity=_reflect(world.evader_velocity),
         wheel_speeds=world.wheel_speeds[..., ::-1],
+        evader_state=state if mirrored is None else mirrored,
     )
+
+
+def _has_mirror_images(model: EvaderModel | None, state: Float[Array, "batch s"] | None) -> bool:
+    if model is None or state is None:
+        return True
+    return eqx.filter_eval_shape(model.mirrored, state[0]) is not None
 
 
 def sample(
@@ -176,13 +186,15 @@ def sample(
         return eqx.tree_at(lambda w: w.target, world, target)
 
     reward, terminated = jax.vmap(reward_along, in_axes=(None, 0, 0))(scenario, picked, target)
-    flip = jax.random.uniform(mirror_key, (batch_size,), dtype=float) < mirror
+    model = scenario.evader_model
+    share = mirror if _has_mirror_images(model, picked.world.evader_state) else 0.0
+    flip = jax.random.uniform(mirror_key, (batch_size,), dtype=float) < share
     velocity = picked.executed if executed_action else picked.proposed
     velocity = jnp.where(flip[:, None], _reflect(velocity), velocity)
     world, next_world = (
         jax.tree.map(
             lambda mirrored, seen: jnp.where(jnp.expand_dims(flip, range(1, seen.ndim)), mirrored, seen),
-            jax.vmap(mirror_world)(world),
+            jax.vmap(lambda one: mirror_world(one, model))(world),
             world,
         )
         for world in (with_target(picked.world), with_target(picked.next_world))

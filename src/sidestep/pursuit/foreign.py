@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arrays import real
-from sidestep.pursuit.pursuers import Pursuer, make_pursuer
+from sidestep.pursuit.catalogue import make_pursuer
+from sidestep.pursuit.pursuers import Pursuer
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 

@@ -198,25 +198,6 @@ class Still(Pursuer):
         return jnp.zeros_like(world.pursuer[:2])
 
 
-PURSUERS: dict[str, type[Pursuer]] = {
-    "nash": Nash,
-    "turn-then-drive": TurnThenDrive,
-    "turn-while-driving": TurnWhileDriving,
-    "pure-pursuit": PurePursuit,
-    "interceptor": Interceptor,
-    "random": Random,
-    "still": Still,
-}
-"""Every strategy by the name the command line knows it by."""
-
-
-def make_pursuer(name: str) -> Pursuer:
-    """The pursuer strategy called `name`; a ValueError lists the names there are."""
-    if name not in PURSUERS:
-        raise ValueError(f"unknown pursuer {name!r}; known pursuers: {', '.join(PURSUERS)}")
-    return PURSUERS[name]()
-
-
 def pursue(
     scenario: Scenario, pursuer: Callable[..., Any], world: World, key: Any
 ) -> Float[Array, "m 2 *lanes"]:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from sidestep.safety.adapted import covered, of_control_point
 from sidestep.safety.claims import Claim, claims_of
 from sidestep.safety.flow_map import seen_from, side_value
 from sidestep.safety.nearest_changes import Change, nearest_changes
@@ -110,6 +111,9 @@ def certify(
 ) -> Certificate:
     """What can be guaranteed for a scenario's robots.
 
+    Of robots of one's own (`EvaderModel`, `PursuerModel`) it is the control point that is spoken of, at
+    distances that are the offset longer, and the differential drive that covers the pursuer.
+
     **Arguments:** `position_error` (m) and `heading_error` (rad) bound every measurement of the pursuer,
     `delay` (s) is its age; `own_motion_predicted`: the evader adds its own motion since.
     `tracking_error` (m/s) bounds how far the velocity driven is from the one told. `walls`: the robots are in
@@ -149,7 +153,7 @@ def certify(
         certificate = replace(certificate, start=start, start_margin=margin)
     if check_shield and game.half_axle > 0.0 and game.control_period > 0.0 and game.evader_speed > 0.0:
         tell("what the game shield keeps")
-        certificate = replace(certificate, shield=shield_level(scenario))
+        certificate = replace(certificate, shield=shield_level(covered(of_control_point(scenario))))
     if certificate.pursuer_wins or target_distance is not None:
         tell("how long the evader lasts")
         distance = plain(scenario.initial_separation)

@@ -23,11 +23,21 @@ class Claim:
 def claims_of(certificate: Certificate) -> tuple[Claim, ...]:
     """All claims of a certificate, the main ones first."""
     situation = certificate.situation
-    claims = [_winner(certificate)]
+    claims = [*_stand_ins(certificate), _winner(certificate)]
     if not situation.walls and situation.pursuer_count == 1:
         claims += _period(certificate)
     claims += [*_survival(certificate), *_shield(certificate), *_obstacles(certificate)]
     return (*claims, *_outside(certificate))
+
+
+def _stand_ins(certificate: Certificate) -> list[Claim]:
+    told = certificate.situation.stands_for
+    if not told:
+        return []
+    text = (
+        f"All of this is about {told}. It holds for the real robots as far as their models keep their words."
+    )
+    return [Claim(COMPUTED, text)]
 
 
 def _winner(certificate: Certificate) -> Claim:

@@ -60,10 +60,13 @@ class _Arrow:
 
 @final
 class _Pursuer:
-    """A differential drive to scale, with its capture circle and its capture set K."""
+    """A differential drive to scale, any other pursuer as a sign of its place, with its capture circle and
+    its capture set K."""
 
     def __init__(self, axes: Axes, scenario: Scenario, number: str):
-        axle = float(scenario.pursuer_half_axle)
+        # One of one's own has wings or whatever; its half axle is only what strategies answer for.
+        own = scenario.pursuer_model is not None
+        axle = 0.6 * float(scenario.capture_distance) if own else float(scenario.pursuer_half_axle)
         self._outline = capture_set_outline(scenario, 61)
         self._circle = float(scenario.capture_distance) * _CIRCLE
         # The axle is true; wheels and body are as large as fits it and the capture circle.

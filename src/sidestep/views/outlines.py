@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.views.motion import relative
-from sidestep.views.scene import capture_set_outline, to_world
+from sidestep.views.scene import capture_set_outline, guarded, to_world
 from sidestep.world import Scenario
 
 PURSUIT_SHIELDS = ("game", "joint")
@@ -30,6 +30,7 @@ def pursuer_heights(
     The game's is the signed distance from the capture set K, which is |x| cos S + |y| sin S - l in front of
     the pursuer and behind it, and |z| - l aside.
     """
+    scenario = guarded(scenario)
     usable = float(scenario.usable_angle) if pursuit else None
     return _heights(points, pose, float(scenario.capture_distance), usable)
 
@@ -52,6 +53,7 @@ class LevelOutlines:
     """
 
     def __init__(self, scenario: Scenario, *, pursuit: bool):
+        scenario = guarded(scenario)
         self._usable = float(scenario.usable_angle) if pursuit else None
         self._capture, self._collision = float(scenario.capture_distance), float(scenario.collision_distance)
         angles = np.linspace(0.0, 2.0 * np.pi, _POINTS)

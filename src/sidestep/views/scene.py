@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
-from sidestep.safety import ObstacleBarrier, PursuitBarrier, RangeBarrier
+from sidestep.safety import ObstacleBarrier, PursuitBarrier, RangeBarrier, covered, of_control_point
 from sidestep.trials import Trajectory
 from sidestep.views.style import EVADER, FAINT, INK, OBSTACLE, PURSUER, TARGET
 from sidestep.world import Scenario, World
@@ -33,12 +34,22 @@ def correction_colours() -> Colormap:
     return LinearSegmentedColormap.from_list("correction", whole(np.linspace(0.12, 0.72, 128)))
 
 
+def guarded(scenario: Scenario) -> Scenario:
+    """The problem whose barriers are drawn: with robots of one's own the one that stands for theirs, of the
+    evader's control point and the differential drive that covers the pursuer."""
+    model = scenario.pursuer_model
+    if model is not None and model.covering(scenario) is None:
+        return of_control_point(dataclasses.replace(scenario, pursuer_model=None))
+    return covered(of_control_point(scenario))
+
+
 def capture_set_outline(scenario: Scenario, points: int = 181) -> Float[np.ndarray, "points 2"]:
     """Outline of the capture set K in the pursuer's frame, m, closed.
 
     The convex hull of the disc of radius l and the points (+-l/rho, 0); the disc alone when the evader is
     at least as fast.
     """
+    scenario = guarded(scenario)
     radius, usable = float(scenario.capture_distance), float(scenario.usable_angle)
     left = np.linspace(usable, np.pi - usable, points // 2)
     arc = radius * np.stack([np.cos(left), np.sin(left)], axis=-1)
@@ -247,6 +258,10 @@ def draw_barrier_levels(
     axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = (0.1, 0.2, 0.3)
 ) -> None:
     """Level sets of the composed barrier h = min_i h_i over evader positions, all others held in place."""
+    scenario, world = (
+        guarded(scenario),
+        eqx.tree_at(lambda w: w.evader_state, world, None, is_leaf=lambda leaf: leaf is None),
+    )
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     x, y = np.linspace(left, right, 160), np.linspace(bottom, top, 160)
     grid = np.stack(np.meshgrid(x, y), axis=-1)

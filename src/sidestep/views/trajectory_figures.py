@@ -164,13 +164,16 @@ def scene_margin(scenario: Scenario) -> float:
     return max(float(scenario.capture_distance), float(scenario.collision_distance)) + 0.08
 
 
-def scene_extent(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x and y (m) of anything that moved, and of the target."""
+def scene_extent(trajectory: Trajectory, near: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest x and y (m) of anything that moved, and of the target; of pursuers only where they
+    are within `near` (m) of the evader."""
     worlds = trajectory.worlds
+    evader, pursuers = np.asarray(worlds.evader), np.asarray(worlds.pursuers)[..., :2]
+    close = np.linalg.norm(pursuers - evader[:, None], axis=-1) <= near
     points = np.concatenate(
         [
-            np.asarray(worlds.evader),
-            np.asarray(worlds.pursuers)[..., :2].reshape(-1, 2),
+            evader,
+            pursuers[close],
             np.asarray(worlds.obstacles)[..., :2].reshape(-1, 2),
             np.asarray(worlds.target)[:1],
         ]

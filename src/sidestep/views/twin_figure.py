@@ -42,14 +42,17 @@ def twin_figure(
     *,
     shield: str = "",
     twin_words: str = "physics twin",
+    near: float = np.inf,
 ) -> tuple[Path, Path]:
     """Both paths at one scale, and below them the least distance to a pursuer and to an obstacle over time.
+
+    A pursuer that is farther than `near` (m) from the evader may be out of the picture.
 
     Writes PNG and PDF; returns their paths.
     """
     with house_style():
         both = {"simulation": simulation, twin_words: twin}
-        extents = [scene_extent(trajectory) for trajectory in both.values()]
+        extents = [scene_extent(trajectory, near) for trajectory in both.values()]
         limits = (
             np.min([low for low, _ in extents], axis=0),
             np.max([high for _, high in extents], axis=0),
@@ -63,7 +66,9 @@ def twin_figure(
         for axes, (words, trajectory) in zip((upper, lower), both.items(), strict=True):
             draw_scene(axes, scenario, trajectory, norm, shield=shield, limits=limits)
             duration = trajectory.length * float(scenario.control_period)
-            titles.append(f"{words.capitalize()}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s")
+            titles.append(
+                f"{words[0].upper()}{words[1:]}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
+            )
         upper.set_xlabel("")
         upper.tick_params(labelbottom=False)
         scene_legend(key, simulation)

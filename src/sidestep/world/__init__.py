@@ -1,6 +1,7 @@
 """What exists and how it moves: robots, world state, scenario, observation, reward and events."""
 
 from sidestep.world.events import Events
+from sidestep.world.flyers import Aircraft, Quadrotor
 from sidestep.world.loading import PRESETS, ScenarioError, load_scenario, scenario_to_dict
 from sidestep.world.model_probe import EvaderProbe, ModelWarning, probe_evader
 from sidestep.world.models import EvaderModel, EvaderState, PursuerModel
@@ -18,12 +19,14 @@ from sidestep.world.state import World
 
 __all__ = [
     "PRESETS",
+    "Aircraft",
     "EvaderModel",
     "EvaderProbe",
     "EvaderState",
     "Events",
     "ModelWarning",
     "PursuerModel",
+    "Quadrotor",
     "Scenario",
     "ScenarioError",
     "World",

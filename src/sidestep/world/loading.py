@@ -18,9 +18,29 @@ import numpy as np
 
 from sidestep._arrays import real
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
+from sidestep.world.flyers import Aircraft, Quadrotor
 from sidestep.world.model_probe import check_models
 from sidestep.world.models import EvaderModel, PursuerModel
 from sidestep.world.scenario import Scenario
+
+_QUADROTOR: dict[str, Any] = {
+    "evader_model": Quadrotor(),
+    "pursuer_model": Aircraft(),
+    "evader_speed": 0.8,
+    "pursuer_speed": 1.0,
+    # What strategies answer wheel speeds for; the aircraft has no axle.
+    "pursuer_half_axle": 1.0,
+    "capture_distance": 0.17,
+    "collision_distance": 0.2,
+    "reach_distance": 0.25,
+    "obstacle_velocity": (0.0, 0.0),
+    "obstacle_count": 3,
+    "arena_side": 5.0,
+    "initial_separation": 1.2,
+    "obstacle_separation": 0.6,
+    "target_separation": 3.0,
+    "episode_steps": 2400,
+}
 
 PRESETS: dict[str, dict[str, Any]] = {
     # The paper's numbers; starts and targets at random. They are the defaults of `Scenario`.
@@ -31,6 +51,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         "obstacle_starts": ((1.5, 0.0),),
         "pursuer_starts": ((1.0, -0.5, 0.0),),
         "target_start": (2.5, 0.0),
+    },
+    # A small quadrotor among columns, chased by a faster aircraft that turns slowly.
+    "quadrotor": _QUADROTOR,
+    # One scene of that kind: the aircraft comes head-on, and columns stand to both sides of the way.
+    "quadrotor-test": {
+        **_QUADROTOR,
+        "evader_start": (0.0, 0.0),
+        "obstacle_starts": ((2.0, 0.9), (2.6, -0.8), (4.2, 0.1)),
+        "pursuer_starts": ((4.0, -1.2, 2.8),),
+        "target_start": (6.0, 0.0),
     },
 }
 
@@ -43,12 +73,15 @@ _NOT_NEGATIVE = {
     "initial_separation", "obstacle_separation", "target_separation",
 }  # fmt: skip
 _COUNTS = {"pursuer_count": 1, "obstacle_count": 0, "episode_steps": 1}
+_STARTS = {"pursuer_starts": "pursuer_count", "obstacle_starts": "obstacle_count"}
 _CHOICES = {
     "action": ("velocity", "heading"),
     "obstacle_directions": ("fixed", "random"),
     "frame": ("target", "world"),
 }
 _MODELS = {"evader_model": EvaderModel, "pursuer_model": PursuerModel}
+_NAMED: dict[str, type[EvaderModel] | type[PursuerModel]] = {"quadrotor": Quadrotor, "aircraft": Aircraft}
+"""Models that a file can name."""
 _SHAPES: dict[str, tuple[int | None, ...]] = {
     "obstacle_velocity": (2,),
     "evader_start": (2,),
@@ -120,8 +153,9 @@ def _check_values(values: Mapping[str, Any]) -> None:
                 _fail(
                     name,
                     value,
-                    f"it must be a {_MODELS[name].__name__}, or None for the built-in robot. It is code: "
-                    "give it to load_scenario beside the file",
+                    f"it must be a {_MODELS[name].__name__}, or None for the built-in robot, or by name "
+                    f"({', '.join(_names_of(name))}). One of your own is code: give it to load_scenario "
+                    "beside the file",
                 )
         elif name == "name" and not isinstance(value, str):
             _fail(name, value, "it must be text")
@@ -166,16 +200,39 @@ def _check_scene(scenario: Scenario) -> None:
             )
 
 
+def _names_of(field: str) -> list[str]:
+    return [name for name, kind in _NAMED.items() if issubclass(kind, _MODELS[field])]
+
+
+def _model(field: str, value: Any) -> Any:
+    """The model that a file names: `"quadrotor"`, or `{model = "quadrotor", time_constant = 0.3}`."""
+    told = {"model": value} if isinstance(value, str) else value
+    if not isinstance(told, Mapping) or told.get("model") not in _names_of(field):
+        return value
+    numbers = {name: number for name, number in told.items() if name != "model"}
+    kind = _NAMED[told["model"]]
+    for name, number in numbers.items():
+        known = [one.name for one in fields(kind)]
+        if name not in known:
+            _fail(field, value, f"a {told['model']} has no '{name}'; it has {', '.join(known)}")
+        if isinstance(number, bool) or not isinstance(number, (int, float)):
+            _fail(field, value, f"'{name}' must be a number")
+    try:
+        return kind(**numbers)
+    except ValueError as error:
+        raise ScenarioError(f"scenario field '{field}' = {value!r}: {error}") from None
+
+
 def _build(values: dict[str, Any]) -> Scenario:
     _check_fields(values)
+    values = {name: _model(name, value) if name in _MODELS else value for name, value in values.items()}
     _check_values(values)
-    values = dict(values)
     for name in _SHAPES:
         if values.get(name) is not None:
             array = np.asarray(values[name], dtype=float)
             # Only `obstacle_starts` may be empty.
             values[name] = jnp.asarray(array if array.size else array.reshape(0, 2), dtype=float)
-    for starts, count in (("pursuer_starts", "pursuer_count"), ("obstacle_starts", "obstacle_count")):
+    for starts, count in _STARTS.items():
         if values.get(starts) is None:
             continue
         given = len(values[starts])
@@ -211,11 +268,13 @@ def _some_start_exists(scenario: Scenario) -> jax.Array:
 
 
 def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
-    """A validated scenario: a preset (`paper`, `paper-test`) or a TOML or JSON file, with overrides.
+    """A validated scenario: a preset (a key of `PRESETS`) or a TOML or JSON file, with overrides.
 
     A file holds fields of `Scenario`; an optional `preset` names the one it starts from (`paper`
     otherwise). A run's `config.json` can be given too: its `scenario` entry is used. Reducing
-    `obstacle_count` or `pursuer_count` below the fixed starts keeps the first ones.
+    `obstacle_count` or `pursuer_count` below the fixed starts keeps the first ones. The robots that fly are
+    known by name, in files too: `evader_model = "quadrotor"`, `pursuer_model = {model = "aircraft",
+    turning_radius = 3.0}`.
 
     **Raises** `ScenarioError` (a `ValueError`) naming the field, its value and what is allowed.
     """
@@ -243,18 +302,30 @@ def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
         preset = content.pop("preset", "paper")
         if preset not in list(PRESETS):
             _fail("preset", preset, f"it must be one of {', '.join(PRESETS)}")
-        values = {"name": path.stem, **PRESETS[preset], **content}
-    return _build({**values, **overrides})
+        values = _changed({"name": path.stem, **PRESETS[preset]}, content)
+    return _build(_changed(values, overrides))
+
+
+def _changed(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """`values` with `changes`; starts that are given anew bring their own number with them."""
+    kept = dict(values)
+    for starts, count in _STARTS.items():
+        if changes.get(starts) is not None:
+            kept.pop(count, None)
+    return {**kept, **changes}
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     """All fields as plain JSON values; `load_scenario` rebuilds the same scenario from them.
 
     Robots of one's own (`evader_model`, `pursuer_model`) are code, and stand there as text that says what
-    they were: `load_scenario` then asks for them.
+    they were: `load_scenario` then asks for them. Those known by name it finds by itself.
     """
 
     def plain(value: Any) -> Any:
+        for name, kind in _NAMED.items():
+            if isinstance(value, kind):
+                return {"model": name, **{one.name: plain(getattr(value, one.name)) for one in fields(value)}}
         if isinstance(value, (jax.Array, np.ndarray)):
             # The shortest decimal that rounds to the stored float: 0.1574, not 0.15739999711513519.
             return np.asarray(value).astype(str).astype(float).tolist()

@@ -55,6 +55,11 @@ class EvaderModel(eqx.Module):
         """How far (m) the control point can be from the robot's position, at most."""
         return real(0.0)
 
+    def mirrored(self, state: Float[Array, "s"]) -> Float[Array, "s"] | None:
+        """What the model keeps, of a robot reflected in the world's x axis. None, unless a model says
+        otherwise: training then learns from no mirror images."""
+        return None
+
 
 class PursuerModel(eqx.Module):
     """What a pursuer can do that is no differential drive, as `Scenario.pursuer_model`.

@@ -328,6 +328,18 @@ class Scenario(eqx.Module):
         certificate and falsifier speak of."""
         return self.evader_model is None and self.pursuer_model is None
 
+    def check_built_in(self, what: str, instead: str) -> None:
+        """**Raises** `ValueError` where the robots are others: `what` is for the built-in ones only, and what
+        to do `instead`."""
+        models = [
+            type(model).__name__ for model in (self.evader_model, self.pursuer_model) if model is not None
+        ]
+        if models:
+            raise ValueError(
+                f"{what} knows the omnidirectional evader and the differential drive only, and the scenario "
+                f"'{self.name}' has {' and '.join(models)}: {instead}"
+            )
+
     def executable(self, velocity: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
         """The velocity (m/s) the evader drives when told `velocity`: on the disc, or on the circle.
 

@@ -49,13 +49,15 @@ def export_jax(
     **Raises** `ValueError` for an unknown `what`, a missing policy, a file that exists, or where flatbuffers
     is not installed.
     """
-    from sidestep.bridges.export.onnx_export import WHAT
+    from sidestep.bridges.export.onnx_export import ALONE, WHAT
 
     needed("flatbuffers", "export", "exporting needs")
     if what not in WHAT:
         raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
     if policy is None and what != "filter":
         raise ValueError(f"exporting {what!r} needs a policy")
+    if what != "policy":
+        scenario.check_built_in("an exported filter", ALONE)
     programs: dict[str, bytes] = {}
     batched = what == "policy" or shield.takes_lanes
     if what == "policy":

@@ -21,6 +21,8 @@ from sidestep.world import Scenario, observation_names, observation_size
 _STEEP = 1e12
 WHAT = ("policy+filter", "policy", "filter")
 """What can be exported."""
+ALONE = "export the policy alone (what='policy', --what policy)"
+"""What to do where a filter cannot be exported."""
 _TEXTS = {
     "policy": "observation (see sidestep.world.observe) -> action in [-1, 1]^2, in the policy's frame",
     "filter": "state of the world, wished velocity and sides of the call before (0 at first) -> safe "
@@ -61,6 +63,8 @@ def export_onnx(
         raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
     if policy is None and what != "filter":
         raise ValueError(f"exporting {what!r} needs a policy")
+    if what != "policy":
+        scenario.check_built_in("an exported filter", ALONE)
     if policy is not None:
         _check_policy(scenario, policy)
     shield = GameShield(scenario) if shield is None else shield

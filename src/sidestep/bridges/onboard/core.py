@@ -27,7 +27,7 @@ from sidestep.learning.control_step import decision_steps_of
 from sidestep.safety import JointShield, Shield, Status, make_shield
 from sidestep.safety.way_out import way_out
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
-from sidestep.world import Scenario
+from sidestep.world import Scenario, World
 
 _BUDGETED = ("game", "joint")
 _CALM = 20
@@ -63,6 +63,10 @@ class Onboard:
         policy: Any = None,
         settings: OnboardSettings | None = None,
     ):
+        scenario.check_built_in(
+            "the decision core", "give it the problem of the evader's control point, sidestep.safety.covered("
+            "of_control_point(scenario)), and poses of that point, as sidestep.bridges.flight.Pilot does",
+        )  # fmt: skip
         self.scenario, self.settings = scenario, settings or OnboardSettings()
         settings = self.settings
         self.settings.budget.check(scenario)
@@ -335,6 +339,11 @@ class Onboard:
             reactions.append(f"nominal velocity lost, {age:.0f} ms old: holding still unless pressed")
             return np.zeros(2), True
         return wished, False
+
+    def world(self, now: float) -> World | None:
+        """Where everything is thought to be when a command given at `now` (s) acts; None before every robot
+        has been seen."""
+        return None if self._unseen() else self._estimate(now + self.settings.response).world()
 
     def _estimate(self, acts: float) -> Seen:
         """Everything as it should be when the command acts; pursuers as last seen unless told otherwise."""

@@ -13,81 +13,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep.bridges.onboard import Decision, Onboard, OnboardSettings
+from sidestep.bridges.onboard import Onboard, OnboardSettings
 from sidestep.bridges.twin.options import TwinOptions
-from sidestep.bridges.twin.twin import Contacts, Twin
+from sidestep.bridges.twin.record import Log, PhysicsEpisode, estimate_error, events_of
+from sidestep.bridges.twin.twin import Twin
 from sidestep.learning.records import OUTCOMES
 from sidestep.pursuit import Pursuer, as_pursuer, pursue
-from sidestep.safety import Budget, Shield, Status
-from sidestep.trials import Trajectory
+from sidestep.safety import Budget, Shield
 from sidestep.trials.keys import start_and_pursuit
-from sidestep.world import Events, Scenario, World
-
-LAG = 0.02
-"""Delay (s) that the motors' lag counts as."""
-"""What the shield allows for (m) beyond the sensors' noise: estimates that lag, motors that need time."""
+from sidestep.world import Scenario, World
 
 
 @dataclass(frozen=True)
-class TwinEpisode:
-    """One episode of T control periods on the twin.
+class TwinEpisode(PhysicsEpisode):
+    """One episode of T control periods on the twin; `tracking_errors` are in m/s, how far the mean velocity
+    of a period was from the command.
 
-    - `trajectory` its truth as a `Trajectory`: worlds at the beginning of each period, the decisions, and
-      events from the least distances at every physics step
-    - `least_pursuer_distance`, `least_obstacle_distance` (m) over the episode, infinite without such a robot
-    - `levels` per period, and `reactions` as pairs of a time (s) and what the decision core said it did
-    - `estimate_errors (T,)` m, the largest error of a robot's estimated place as seen from the evader;
-      `tracking_errors (T,)` m/s, how far the mean velocity of a period was from the command
-    - `compute_seconds (T,)` what each decision took
     - `frames` and `frame_times` positions at 100 Hz, for `write_video`
     """
 
-    scenario: Scenario
     options: TwinOptions
-    seed: int
-    trajectory: Trajectory
-    least_pursuer_distance: float
-    least_obstacle_distance: float
-    levels: tuple[str, ...]
-    reactions: tuple[tuple[float, str], ...]
-    estimate_errors: Float[np.ndarray, "t"]
-    tracking_errors: Float[np.ndarray, "t"]
-    compute_seconds: Float[np.ndarray, "t"]
     frames: Float[np.ndarray, "n nq"]
     frame_times: Float[np.ndarray, "n"]
-
-    @property
-    def outcome(self) -> str:
-        """`captured`, `collided`, `reached`, `timed_out`, or `cut` when it was stopped before."""
-        return self.trajectory.outcome
-
-    @property
-    def duration(self) -> float:
-        """Seconds."""
-        return self.trajectory.length * float(self.scenario.control_period)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Its figures as plain values; None for the distance to robots that there are none of."""
-        status = np.asarray(self.trajectory.status)
-        return {
-            "seed": self.seed,
-            "outcome": self.outcome,
-            "duration": self.duration,
-            "least_pursuer_distance": _finite(self.least_pursuer_distance),
-            "least_obstacle_distance": _finite(self.least_obstacle_distance),
-            "infeasible_periods": int(np.sum(status == Status.INFEASIBLE)),
-            "periods": self.trajectory.length,
-            "periods_not_normal": sum(level != "normal" for level in self.levels),
-            "reactions": sorted({text for _, text in self.reactions}),
-            "estimate_error_p99": float(np.quantile(self.estimate_errors, 0.99)),
-            "tracking_error_p99": float(np.quantile(self.tracking_errors, 0.99)),
-            "compute_seconds_p50": float(np.quantile(self.compute_seconds, 0.5)),
-            "compute_seconds_p99": float(np.quantile(self.compute_seconds, 0.99)),
-        }
-
-
-def _finite(distance: float) -> float | None:
-    return distance if np.isfinite(distance) else None
 
 
 @eqx.filter_jit
@@ -180,7 +127,7 @@ def twin_episode(
     truth = twin.world
     onboard.target = (float(truth.target[0]), float(truth.target[1]))
     period = float(scenario.control_period)
-    log = _Log(truth)
+    log = Log(truth)
     for count in range(limit):
         now = twin.time
         for robot, index, stamp, pose in twin.measurements():
@@ -193,99 +140,24 @@ def twin_episode(
         twin.command(decision.velocity, wheels)
         contacts = twin.advance((count + 1) * period - now)
         before, truth = truth, twin.world
-        events = _events(scenario, truth, contacts, count + 1 >= scenario.episode_steps)
-        log.add(now, before, decision, wheels, truth, events, period)
+        events = events_of(scenario, truth, contacts, count + 1 >= scenario.episode_steps)
+        error = estimate_error(decision, before)
+        driven = _driven(before, truth, period) - np.asarray(decision.velocity)
+        log.add(now, decision, wheels, truth, events, error, float(np.hypot(*driven)))
         if any(events[name] for name in OUTCOMES):
             break
-    return log.episode(scenario, twin, seed)
+    pursuer_distance, obstacle_distance = twin.least_distances
+    return TwinEpisode(
+        scenario=scenario,
+        seed=seed,
+        least_pursuer_distance=pursuer_distance,
+        least_obstacle_distance=obstacle_distance,
+        **log.kept(),
+        options=twin.options,
+        frames=np.array(twin.frames),
+        frame_times=np.array(twin.frame_times),
+    )
 
 
-def _events(scenario: Scenario, world: World, contacts: Contacts, last: bool) -> dict[str, Any]:
-    """What a period brought, in the terms of the plain simulation."""
-    distance = float(np.hypot(*(np.asarray(world.evader) - np.asarray(world.target))))
-    cost = -float(scenario.distance_cost) * distance
-    over = last and not (contacts.captured or contacts.collided or contacts.reached)
-    return {
-        "reward": np.float32(scenario.reach_reward if contacts.reached else cost),
-        "captured": np.bool_(contacts.captured),
-        "collided": np.bool_(contacts.collided),
-        "reached": np.bool_(contacts.reached),
-        "timed_out": np.bool_(over),
-        "pursuer_clearance": np.float32(contacts.pursuer_distance - float(scenario.capture_distance)),
-        "obstacle_clearance": np.float32(contacts.obstacle_distance - float(scenario.collision_distance)),
-    }
-
-
-def _relative(world: World) -> Float[np.ndarray, "n 2"]:
-    places = np.concatenate([np.asarray(world.pursuers)[:, :2], np.asarray(world.obstacles)[:, :2]])
-    return places - np.asarray(world.evader)
-
-
-class _Log:
-    """What is written down period by period."""
-
-    def __init__(self, start: World):
-        self._worlds, self._entries, self._events = [start], [], []
-        self._levels: list[str] = []
-        self._reactions: list[tuple[float, str]] = []
-        self._numbers: list[tuple[float, float, float]] = []
-
-    def add(
-        self,
-        now: float,
-        before: World,
-        decision: Decision,
-        wheels: Float[np.ndarray, "m 2"],
-        after: World,
-        events: dict[str, Any],
-        period: float,
-    ) -> None:
-        self._worlds.append(after)
-        self._events.append(events)
-        self._entries.append(
-            {
-                "nominal": np.asarray(decision.nominal, np.float32),
-                "action": np.asarray(decision.velocity, np.float32),
-                "wheel_speeds": wheels,
-                "status": np.int32(decision.status),
-                "barriers": np.asarray(decision.barriers, np.float32),
-                "slack": np.float32(decision.slack),
-                "intervention": np.float32(np.nan_to_num(decision.intervention)),
-            }
-        )
-        self._levels.append(decision.level)
-        self._reactions += [(now, text) for text in decision.reactions]
-        error = np.zeros(0)
-        if decision.world is not None:
-            error = np.linalg.norm(_relative(decision.world) - _relative(before), axis=-1)
-        driven = (np.asarray(after.evader) - np.asarray(before.evader)) / period
-        self._numbers.append(
-            (
-                float(np.max(error, initial=0.0)),
-                float(np.hypot(*(driven - np.asarray(decision.velocity)))),
-                float(decision.compute_seconds),
-            )
-        )
-
-    def episode(self, scenario: Scenario, twin: Twin, seed: int) -> TwinEpisode:
-        stacked = lambda trees: jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)  # noqa: E731
-        # On the host first, or JAX would compile a stack of every new length.
-        worlds = stacked([jax.tree.map(np.asarray, world) for world in self._worlds])
-        entries = stacked(self._entries)
-        numbers = np.array(self._numbers)
-        pursuer, obstacle = twin.least_distances
-        return TwinEpisode(
-            scenario=scenario,
-            options=twin.options,
-            seed=seed,
-            trajectory=Trajectory(worlds=worlds, events=Events(**stacked(self._events)), **entries),
-            least_pursuer_distance=pursuer,
-            least_obstacle_distance=obstacle,
-            levels=tuple(self._levels),
-            reactions=tuple(self._reactions),
-            estimate_errors=numbers[:, 0],
-            tracking_errors=numbers[:, 1],
-            compute_seconds=numbers[:, 2],
-            frames=np.array(twin.frames),
-            frame_times=np.array(twin.frame_times),
-        )
+def _driven(before: World, after: World, period: float) -> Float[np.ndarray, "2"]:
+    return (np.asarray(after.evader) - np.asarray(before.evader)) / period

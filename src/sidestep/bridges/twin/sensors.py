@@ -91,7 +91,11 @@ def make_sensors(name: str, overrides: Mapping[str, Any] | None = None) -> Senso
     """
     if name not in SENSORS:
         raise TwinError(f"no sensors {name!r}; use one of {', '.join(SENSORS)}")
-    changes = dict(overrides or {})
+    return changed_sensors(SENSORS[name], dict(overrides or {}))
+
+
+def changed_sensors(sensors: Sensors, changes: Mapping[str, Any]) -> Sensors:
+    """`sensors` with some fields changed. **Raises** `TwinError` naming the known fields."""
     known = [field.name for field in dataclasses.fields(Sensors)]
     for field, value in changes.items():
         if field not in known:
@@ -101,7 +105,7 @@ def make_sensors(name: str, overrides: Mapping[str, Any] | None = None) -> Senso
         wanted = bool if field == "synchronised" else (int, float)
         if not isinstance(value, wanted) or (field != "synchronised" and isinstance(value, bool)):
             raise TwinError(f"sensors: {field} = {value!r}: it must be {_KINDS[field == 'synchronised']}")
-    return dataclasses.replace(SENSORS[name], **changes)
+    return dataclasses.replace(sensors, **changes)
 
 
 _KINDS = {True: "true or false", False: "a number"}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float
 
 from sidestep.bridges.twin.actuation import DelayLine, omniwheel_speeds, yaw_rate
+from sidestep.bridges.twin.contacts import Contacts, Watch
 from sidestep.bridges.twin.library import TwinError, load_mujoco
 from sidestep.bridges.twin.options import TwinOptions
 from sidestep.bridges.twin.robots import WHEEL_RADIUS, scene_xml
@@ -20,23 +20,7 @@ _SETTLE = 0.3
 _SEEN_BEFORE = 0.5
 _COLOURS = ("#0072B2", "#D55E00", "#595959")
 _FRAME_RATE = 100.0
-_LIMITS = ("evader_speed", "pursuer_speed", "capture_distance", "collision_distance", "reach_distance")
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """What one stretch of time brought, from the true positions at every physics step.
-
-    `pursuer_distance` and `obstacle_distance` are the least distances (m) between centres, infinite without
-    such a robot; `target_distance` (m) the least one to the target.
-    """
-
-    pursuer_distance: float
-    obstacle_distance: float
-    target_distance: float
-    captured: bool
-    collided: bool
-    reached: bool
+_LIMITS = ("evader_speed", "pursuer_speed")
 
 
 class _Places:
@@ -86,10 +70,11 @@ class Twin:
     **Attributes:** `model` and `data` of MuJoCo; `frames` the positions (n, nq) at 100 Hz since the reset
     and `frame_times (n,)` in s, to be drawn.
 
-    **Raises** `TwinError` when MuJoCo is missing.
+    **Raises** `TwinError` when MuJoCo is missing, `ValueError` for robots of one's own.
     """
 
     def __init__(self, scenario: Scenario, options: TwinOptions | None = None, seed: int = 0):
+        scenario.check_built_in("the twin", "`sidestep fly` flies a quadrotor, sidestep.bridges.flight")
         self._mujoco = mujoco = load_mujoco()
         self.scenario, self.options = scenario, options or TwinOptions()
         self._seed = seed
@@ -150,7 +135,7 @@ class Twin:
             PoseSensor(self.options.sensors, robot, index, self.options.physics_step, generator)
             for (robot, index), generator in zip(names, root.spawn(len(names)), strict=True)
         ]
-        self._least = [math.inf, math.inf]
+        self._contacts = Watch(scenario, self._target)
         self._watch_the_start()
 
     def _watch_the_start(self) -> None:
@@ -185,7 +170,7 @@ class Twin:
     @property
     def least_distances(self) -> tuple[float, float]:
         """Least true distances (m) to a pursuer and to an obstacle since the reset; infinite without one."""
-        return self._least[0], self._least[1]
+        return self._contacts.least
 
     def command(self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"]) -> None:
         """What evader (m/s, world axes) and pursuers (rim speeds, m/s) are told now, cut to their limits.
@@ -225,7 +210,7 @@ class Twin:
             raise TwinError(f"the physics became unstable at {self.time:.3f} s; use a smaller physics_step")
         poses = self.poses_of(trace)
         self._watch(self._steps - count + 1, poses)
-        return self._contacts(poses)
+        return self._contacts.see(poses)
 
     def _drive(self, velocity: Float[np.ndarray, "2"]) -> None:
         """Set the evader's motors for a velocity (m/s, world axes)."""
@@ -254,20 +239,6 @@ class Twin:
     def _watch(self, first: int, poses: Float[np.ndarray, "n robots 3"]) -> None:
         for robot, sensor in enumerate(self._sensors):
             sensor.watch(first, poses[:, robot])
-
-    def _contacts(self, poses: Float[np.ndarray, "n robots 3"]) -> Contacts:
-        evader, pursuers = poses[:, 0, :2], 1 + len(self._places.pursuers)
-        apart = np.linalg.norm(poses[:, 1:, :2] - evader[:, None], axis=-1)
-        least = [
-            float(np.min(group, initial=math.inf))
-            for group in (apart[:, : pursuers - 1], apart[:, pursuers - 1 :])
-        ]
-        to_target = float(np.min(np.linalg.norm(evader - self._target, axis=-1), initial=math.inf))
-        self._least = [min(old, new) for old, new in zip(self._least, least, strict=True)]
-        captured = least[0] <= self._limits["capture_distance"]
-        collided = least[1] <= self._limits["collision_distance"]
-        reached = to_target <= self._limits["reach_distance"] and not captured and not collided
-        return Contacts(least[0], least[1], to_target, captured, collided, reached)
 
     def measurements(self) -> list[Measurement]:
         """What has arrived by now and was not handed out before; per robot, oldest first."""

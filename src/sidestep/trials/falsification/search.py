@@ -99,8 +99,8 @@ def falsify(
 
     Ctrl-C ends the search with what it has found.
 
-    **Raises** `ValueError` for settings that make no sense (see `check_plan`), a folder that is in use, or
-    one to resume that holds no search.
+    **Raises** `ValueError` for settings that make no sense (see `check_plan`), robots that are not the
+    built-in ones, a folder that is in use, or one to resume that holds no search.
     """
     folder = Path(out)
     source = policy if isinstance(policy, (str, Path)) else None
@@ -114,6 +114,10 @@ def falsify(
     if resume:
         scenario, source, shield, plan = _stored(folder, policy, shield)
     policy = _load(source) if source is not None else policy
+    scenario.check_built_in(
+        "the falsifier", "search with evaluate, over pursuers and starts, or falsify the problem that covers "
+        "theirs, sidestep.safety.covered(of_control_point(scenario))",
+    )  # fmt: skip
     check_plan(scenario, plan)
     shield_called = shield_name(shield, scenario)
     target = Target(scenario, as_policy(policy, scenario), as_shield(shield, scenario))

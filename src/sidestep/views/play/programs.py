@@ -22,9 +22,12 @@ class Programs:
     """The program of every shield for one scenario, each compiled when it is first wanted.
 
     `warm` returns at once; a thread of its own does the work, one shield after the other.
+
+    **Raises** `ValueError` for robots of one's own, of which the page can draw and step nothing.
     """
 
     def __init__(self, scenario: Scenario, policy: Callable[..., Any]):
+        scenario.check_built_in("the page", "watch an episode of theirs instead, sidestep evaluate --video")
         self.scenario, self.policy = scenario, policy
         self._programs = {name: Program(scenario, name, policy) for name in SHIELDS}
         self.layout = next(iter(self._programs.values()))

@@ -1,0 +1,130 @@
+"""Robots that fly at one height: a quadrotor that is told velocities, and an aircraft that turns slowly."""
+
+from __future__ import annotations
+
+from typing import final
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sidestep._arrays import Scalar, real
+from sidestep.world.models import EvaderModel, EvaderState, PursuerModel
+from sidestep.world.scenario import Scenario
+
+GRAVITY = 9.81
+"""m/s^2."""
+_NEWTON_STEPS = 8
+
+
+@final
+class Quadrotor(EvaderModel):
+    """A quadrotor whose autopilot turns velocities into a motion that the airframe can follow.
+
+    With the velocity u told, the motion asked of the airframe is
+
+        a' = ((u - v)/tau - a)/T,   v' = a,   p' = v,
+
+    tau being the time constant of the velocity loop and T that of the attitude, which stands for the
+    acceleration. The control point p + tau v + tau T a moves as told, and is never farther from p than
+    tau v_e as long as it has been told no more than v_e (the response from its motion to that difference has
+    no overshoot for tau > 4 T). What the airframe lags behind this motion is a position error, see
+    `sidestep.bridges.flight`.
+
+    **Raises** `ValueError` for time constants that are not above 0, or tau <= 4 T.
+    """
+
+    time_constant: float = 0.22
+    """tau, s."""
+    attitude_lag: float = 0.05
+    """T, s."""
+
+    def __check_init__(self):
+        tau, lag = float(self.time_constant), float(self.attitude_lag)
+        if not (tau > 0.0 and lag > 0.0 and tau > 4.0 * lag):
+            raise ValueError(
+                f"time_constant = {tau:g} s, attitude_lag = {lag:g} s: both must be above 0, and the time "
+                "constant more than four times the lag, or the velocity overshoots"
+            )
+
+    def _rates(self) -> tuple[Scalar, Scalar]:
+        """The two rates (1/s, negative) at which the velocity settles."""
+        tau, lag = real(self.time_constant), real(self.attitude_lag)
+        root = jnp.sqrt(tau * tau - 4.0 * tau * lag)
+        return (root - tau) / (2.0 * tau * lag), -(root + tau) / (2.0 * tau * lag)
+
+    def largest_acceleration(self, scenario: Scenario) -> Scalar:
+        """The most (m/s^2) that any sequence of velocities up to v_e makes it accelerate: 2 v_e times the
+        peak of the response of v to an impulse of u."""
+        slow, fast = self._rates()
+        when = jnp.log(fast / slow) / (slow - fast)
+        peak = slow * fast / (slow - fast) * (jnp.exp(slow * when) - jnp.exp(fast * when))
+        return 2.0 * scenario.evader_speed * peak
+
+    def largest_tilt(self, scenario: Scenario) -> Scalar:
+        """The tilt (rad) that the largest acceleration takes at constant height."""
+        return jnp.arctan(self.largest_acceleration(scenario) / GRAVITY)
+
+    def start(self, scenario: Scenario, key: PRNGKeyArray) -> Float[Array, "2"]:
+        """It hovers: acceleration (m/s^2) 0."""
+        return jnp.zeros(2, dtype=float)
+
+    def after(
+        self, scenario: Scenario, robot: EvaderState, command: Float[Array, "2"], time: Scalar
+    ) -> EvaderState:
+        slow, fast = self._rates()
+        excess = robot.velocity - command
+        one = (robot.state - fast * excess) / (slow - fast)
+        other = excess - one
+        position = robot.position + command * time
+        position += one * jnp.expm1(slow * time) / slow + other * jnp.expm1(fast * time) / fast
+        one, other = one * jnp.exp(slow * time), other * jnp.exp(fast * time)
+        return EvaderState(position, command + one + other, slow * one + fast * other)
+
+    def control_point(self, scenario: Scenario, robot: EvaderState) -> Float[Array, "2"]:
+        return robot.position + self.time_constant * (robot.velocity + self.attitude_lag * robot.state)
+
+    def mirrored(self, state: Float[Array, "2"]) -> Float[Array, "2"]:
+        return state * real((1.0, -1.0))
+
+    def offset(self, scenario: Scenario) -> Scalar:
+        return self.time_constant * scenario.evader_speed
+
+
+@final
+class Aircraft(PursuerModel):
+    """Flies forwards at `slowest` V to V, on arcs of `turning_radius` (m) or more.
+
+    Shields guard against the differential drive that can do all this and leaves the largest capture distance:
+    b = (y - 1) R and V' = y V, with y the root of y^3 - 2 y^2 + (v_e/V)^2 = 0 between 1.6 and 2.
+
+    **Raises** `ValueError` for a radius that is not above 0, or a share outside [0, 1].
+    """
+
+    turning_radius: float = 4.0
+    """R, m."""
+    slowest: float = 0.5
+    """Least speed, as a share of V."""
+
+    def __check_init__(self):
+        if not float(self.turning_radius) > 0.0:
+            raise ValueError(f"turning_radius = {self.turning_radius!r}: it must be above 0 m")
+        if not 0.0 <= float(self.slowest) <= 1.0:
+            raise ValueError(f"slowest = {self.slowest!r}: it must be a share from 0 to 1")
+
+    def limit(self, scenario: Scenario, speed: Scalar, turn_rate: Scalar) -> tuple[Scalar, Scalar]:
+        top = scenario.pursuer_speed
+        speed = jnp.clip(speed, self.slowest * top, top)
+        tightest = speed / self.turning_radius
+        return speed, jnp.clip(turn_rate, -tightest, tightest)
+
+    def corners(self, scenario: Scenario) -> Float[Array, "4 2"]:
+        top, rate = scenario.pursuer_speed, 1.0 / self.turning_radius
+        shares = real([(1.0, rate), (1.0, -rate)])
+        return jnp.concatenate([top * shares, self.slowest * top * shares])
+
+    def covering(self, scenario: Scenario) -> tuple[Scalar, Scalar]:
+        ratio = jnp.minimum(scenario.evader_speed / scenario.pursuer_speed, 1.0)
+        y = real(2.0)
+        for _ in range(_NEWTON_STEPS):
+            y -= (y**3 - 2.0 * y**2 + ratio**2) / (3.0 * y**2 - 4.0 * y)
+        return y * scenario.pursuer_speed, (y - 1.0) * self.turning_radius
