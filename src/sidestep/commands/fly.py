@@ -59,9 +59,13 @@ class Fly:
     out: Path | None = None
     """Folder for the figure of the first flight beside the plain simulation, and its recording."""
     video: Path | None = None
-    """Also render the first flight into this MP4 file."""
+    """Also render the first flight into this .mp4, .gif or .webp file."""
     speed: float = 1.0
     """How many times faster the video runs."""
+    rate: int = 25
+    """Pictures per second of the video."""
+    width: int = 960
+    """Width of the video in pixels; 16 by 9."""
     json: Path | None = None
     """Also write the figures to this file."""
 
@@ -76,6 +80,11 @@ def run(command: Fly, console: Console) -> int:
 
     if command.seeds < 1:
         raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
+    if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:
+        raise ValueError(
+            f"rate = {command.rate}, width = {command.width}: the rate must be at least 1, the width an even "
+            "number from 64 to 1920"
+        )
     if not command.speed > 0.0:
         raise ValueError(f"speed = {command.speed}: it must be greater than 0")
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
@@ -126,7 +135,8 @@ def run(command: Fly, console: Console) -> int:
     if command.out is not None:
         _draw(command, scenario, policy, pilot.shield, first, command.out, console)
     if command.video is not None:
-        path = write_video(first, command.video, speed=command.speed)
+        size = (round(command.width * 9 / 32) * 2, command.width)
+        path = write_video(first, command.video, speed=command.speed, rate=command.rate, size=size)
         console.print(f"Video: {path}", soft_wrap=True)
     return 0
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from sidestep.bridges.flight.episode import FlightEpisode
 from sidestep.bridges.flight.flight import Flight
 from sidestep.bridges.twin.drawing import Decor, camera_over, rgba, thinned
-from sidestep.bridges.twin.library import load_av, load_mujoco, make_renderer
+from sidestep.bridges.twin.library import load_mujoco, make_renderer
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER, TARGET
 from sidestep.views.video_files import write_video_file
 
@@ -77,12 +77,12 @@ def write_video(
     speed: float = 1.0,
     size: tuple[int, int] = _SIZE,
 ) -> Path:
-    """Write a flight as an MP4 video (H.264) of `rate` frames per second, `speed` times as fast as it was.
+    """Write a flight as a video of `rate` frames per second, `speed` times as fast as it was: .mp4, .gif or
+    .webp.
 
-    It ends with one second of the last frame. **Raises** `TwinError` when PyAV or off-screen rendering is
-    missing, and as `write_video_file`.
+    It ends with one second of the last frame. **Raises** `TwinError` when off-screen rendering is missing,
+    and as `write_video_file`.
     """
-    load_av()
     times = np.arange(0.0, episode.frame_times[-1], speed / rate)
     frames = frames_of(episode, np.append(times, episode.frame_times[-1]), size)
     return write_video_file(path, frames, rate, hold=1.0)
