@@ -18,7 +18,14 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from sidestep.bench.peer_task import PeerTask
-from sidestep.bridges.gym import ID, PursuedEnv, PursuedVectorEnv, SafetyGymnasiumWrapper, ShieldWrapper
+from sidestep.bridges.gym import (
+    ID,
+    PursuedEnv,
+    PursuedVectorEnv,
+    SafetyGymnasiumWrapper,
+    ShieldVectorWrapper,
+    ShieldWrapper,
+)
 from sidestep.bridges.gym.calls import seed_words
 from sidestep.safety import Status, make_shield
 from sidestep.trials import evaluate
@@ -338,6 +345,56 @@ def test_the_shield_keeps_somebody_elses_robot_from_being_caught():
         assert corrected
         assert all(info["intervention"] > 0.0 for info in corrected)
         assert all(info["executed"].shape == (2,) for info in corrected)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_the_shield_keeps_many_of_them_each_with_a_memory_of_its_own(mode):
+    """The second robot starts an episode later than the first: then all is for it as it was for that."""
+    scenario = load_scenario("paper", capture_distance=0.15, episode_steps=100)
+
+    def worlds_of(env):
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *map(world_of, env.unwrapped.envs))
+
+    inner = gymnasium.vector.SyncVectorEnv([lambda: Foreign(scenario)] * 2, autoreset_mode=mode)
+    steer = jax.jit(jax.vmap(lambda world, action: to_velocity(scenario, world, action)))
+    back = jax.jit(jax.vmap(lambda world, velocity: to_action(scenario, world, velocity)))
+    env = ShieldVectorWrapper(
+        inner,
+        make_shield("game", scenario),
+        worlds_of,
+        velocities_of=lambda actions, worlds: steer(worlds, np.asarray(actions)),
+        actions_of=lambda velocities, worlds: back(worlds, velocities),
+    )
+    with pytest.raises(ResetNeeded):
+        env.step(np.stack([AHEAD] * 2))
+    env.reset(seed=0)
+    late = 40
+    log, ended = [], []
+    for count in range(210):
+        if count == late:
+            # Carried back to its start; as after any end of an episode there, its memory is gone.
+            inner.envs[1].reset()
+            env._fresh = np.array([False, True])
+        *_, terminated, truncated, info = env.step(np.stack([AHEAD] * 2))
+        assert info["executed"].shape == info["proposed"].shape == (2, 2)
+        untouched = info["status"] == Status.OK
+        np.testing.assert_array_equal(info["executed"][untouched], info["proposed"][untouched])
+        log.append((info["status"], info["intervention"], info["_status"]))
+        ended.append(terminated | truncated)
+    status, intervention, told = (np.array(part) for part in zip(*log, strict=True))
+    ended = np.array(ended)
+    first, second = np.flatnonzero(ended[:, 0])[0] + 1, np.flatnonzero(ended[late:, 1])[0] + 1
+    assert first == second
+    assert np.any(status[:first, 0] == Status.CORRECTED)
+    # Each episode as the one before it, or beside it.
+    pause = 1 if mode is AutoresetMode.NEXT_STEP else 0
+    length = min(first, 210 - first - pause)
+    again = slice(first + pause, first + pause + length)
+    np.testing.assert_array_equal(status[again, 0], status[:length, 0])
+    np.testing.assert_allclose(intervention[again, 0], intervention[:length, 0], atol=1e-6)
+    np.testing.assert_array_equal(status[late : late + first, 1], status[:first, 0])
+    assert np.array_equal(np.flatnonzero(~told[:, 0]), np.flatnonzero(ended[:-1, 0]) + 1 if pause else [])
+    assert min(np.min(one["gap"]) for one in [info]) > 0.15
 
 
 def test_safety_gymnasium_gets_its_cost_third():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.pursuit.pursuers import make_pursuer
+from sidestep.pursuit import make_pursuer
 from sidestep.safety import SHIELDS, JointShield, PursuitBarrier, Status, as_shield, make_shield
 from sidestep.world import World, load_scenario
 

@@ -220,5 +220,7 @@ def _outside(certificate: Certificate) -> list[Claim]:
         "wheels not "
         "to slip."
     )
+    if situation.stands_for:
+        model = "Robots that move otherwise than their models say."
     texts = [walls, *([several] if situation.pursuer_count > 1 else []), model]
     return [Claim(NOT_CLAIMED, text) for text in texts]

@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from sidestep.trials import InterventionMap
 from sidestep.views.outlines import PURSUIT_SHIELDS
-from sidestep.views.scene import capture_set_outline, correction_colours
+from sidestep.views.scene import capture_set_outline, correction_colours, guarded
 from sidestep.views.style import (
     COLUMN,
     INK,
@@ -100,6 +100,7 @@ def _share_colours() -> Colormap:
 
 
 def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -> None:
+    built_in, scenario = scenario.built_in, guarded(scenario)
     radius, usable = float(scenario.capture_distance), float(scenario.usable_angle)
     half_axle = float(scenario.pursuer_half_axle)
     line = np.linspace(-reach, reach, 161)
@@ -121,7 +122,7 @@ def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -
             Arc((0, 0), 2 * radius, 2 * radius, angle=towards, theta1=-degrees, theta2=degrees, color=PURSUER,
                 linewidth=2.2, zorder=6)
         )  # fmt: skip
-    for wheel in (-half_axle, half_axle):
+    for wheel in (-half_axle, half_axle) if built_in else ():
         place = (-0.3 * half_axle, wheel - 0.08 * half_axle)
         axes.add_patch(
             Rectangle(place, 0.6 * half_axle, 0.16 * half_axle, facecolor=INK, linewidth=0, zorder=6)

@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from sidestep.views.motion import Instant
 from sidestep.views.outlines import LevelOutlines
-from sidestep.views.scene import capture_set_outline, to_world
+from sidestep.views.scene import capture_set_outline, drawn_half_axle, to_world
 from sidestep.views.style import EVADER, INK, OBSTACLE, OUTCOME_COLOURS, PURSUER, TARGET
 from sidestep.world import Scenario
 
@@ -64,9 +64,7 @@ class _Pursuer:
     its capture set K."""
 
     def __init__(self, axes: Axes, scenario: Scenario, number: str):
-        # One of one's own has wings or whatever; its half axle is only what strategies answer for.
-        own = scenario.pursuer_model is not None
-        axle = 0.6 * float(scenario.capture_distance) if own else float(scenario.pursuer_half_axle)
+        axle = drawn_half_axle(scenario)
         self._outline = capture_set_outline(scenario, 61)
         self._circle = float(scenario.capture_distance) * _CIRCLE
         # The axle is true; wheels and body are as large as fits it and the capture circle.

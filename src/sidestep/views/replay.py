@@ -16,6 +16,7 @@ from markupsafe import Markup
 from sidestep.safety import Status
 from sidestep.trials import Trajectory, WorstEpisode
 from sidestep.views.html import shown_number
+from sidestep.views.scene import drawn_half_axle
 from sidestep.views.style import OUTCOME_WORDS, shield_words
 from sidestep.world import Scenario
 
@@ -119,12 +120,12 @@ def _packed(scenario: Scenario, shield: str, episode: WorstEpisode) -> dict[str,
         "target": [round(float(value), 4) for value in np.asarray(trajectory.worlds.target)[first]],
         "arena": float(scenario.arena_side),
         "reach": float(scenario.reach_distance),
-        "numbers": {
+        "numbers": {"pursuer_half_axle": drawn_half_axle(scenario)}
+        | {
             name: float(getattr(scenario, name))
             for name in (
                 "evader_speed",
                 "pursuer_speed",
-                "pursuer_half_axle",
                 "capture_distance",
                 "collision_distance",
             )

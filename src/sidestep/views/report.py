@@ -24,6 +24,7 @@ from sidestep.views.intervention_figure import intervention_figure
 from sidestep.views.pooling import pooled_evaluation
 from sidestep.views.replay import AFTER, BEFORE, episodes_for_page, player
 from sidestep.views.runs import Run, by_shield, load_run
+from sidestep.views.scene import guarded
 from sidestep.views.style import COLUMN, OUTCOME_WORDS, shield_colour, shield_words
 from sidestep.views.training_figures import (
     PAPER_CONVERGED,
@@ -388,19 +389,21 @@ def _capture_section(groups: Mapping[str, Sequence[Run]], folder: Path) -> dict[
 
 
 def _game_numbers(scenario: Scenario) -> dict[str, Any]:
-    game = CaptureGame.of(scenario)
+    kept = guarded(scenario)
+    game = CaptureGame.of(kept)
     evader, pursuer = float(scenario.evader_speed), float(scenario.pursuer_speed)
     gain = float(scenario.pursuer_gain)
     largest = float(game.largest_capture_distance)
     return {
         "evader_speed": evader,
         "pursuer_speed": pursuer,
-        "capture_distance": float(scenario.capture_distance),
+        "capture_distance": float(kept.capture_distance),
+        "own_robots": not scenario.built_in,
         "gain": gain,
         "slower": evader < pursuer,
         "infeasible_below": (pursuer - evader) / gain if gain > 0 else None,
         "largest_capture_distance": largest if np.isfinite(largest) else None,
-        "margin_mm": 1000 * (largest - float(scenario.capture_distance)) if np.isfinite(largest) else None,
+        "margin_mm": 1000 * (largest - float(kept.capture_distance)) if np.isfinite(largest) else None,
         "escapes": bool(game.evader_can_escape),
         "period_ms": 1000 * float(scenario.control_period),
     }

@@ -43,6 +43,13 @@ def guarded(scenario: Scenario) -> Scenario:
     return covered(of_control_point(scenario))
 
 
+def drawn_half_axle(scenario: Scenario) -> float:
+    """Half the axle (m) of a pursuer as it is drawn. One of one's own has wings or whatever: its half axle is
+    only what strategies answer for, and it is drawn within its capture circle."""
+    own = scenario.pursuer_model is not None
+    return 0.6 * float(scenario.capture_distance) if own else float(scenario.pursuer_half_axle)
+
+
 def capture_set_outline(scenario: Scenario, points: int = 181) -> Float[np.ndarray, "points 2"]:
     """Outline of the capture set K in the pursuer's frame, m, closed.
 

@@ -230,6 +230,8 @@ class Flight:
             self._show()
             self._mujoco.mj_step(self.model, data)
             self._steps += 1
+            if self._steps % self._ticks == 0:
+                self._plan[:] = self._transition @ self._plan
             poses[index] = self._poses()
             for robot, sensor in enumerate(self._sensors):
                 sensor.watch(self._steps, poses[index : index + 1, robot])
@@ -244,8 +246,6 @@ class Flight:
         """One period of the autopilot."""
         data, period = self.data, self.options.autopilot_period
         plan = self._plan
-        if self._steps:
-            plan[:] = self._transition @ plan
         tau, lag = self._lags
         rotation = np.asarray(data.xmat[self._body]).reshape(3, 3)
         felt = np.asarray(data.qacc[:3]) + self._noise.standard_normal(3) * (

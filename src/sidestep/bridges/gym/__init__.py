@@ -11,7 +11,11 @@ gymnasium = needed("gymnasium", "gym", "the Gymnasium environments need")
 
 from sidestep.bridges.gym.environment import PursuedEnv  # noqa: E402
 from sidestep.bridges.gym.vector import PursuedVectorEnv  # noqa: E402
-from sidestep.bridges.gym.wrappers import SafetyGymnasiumWrapper, ShieldWrapper  # noqa: E402
+from sidestep.bridges.gym.wrappers import (  # noqa: E402
+    SafetyGymnasiumWrapper,
+    ShieldVectorWrapper,
+    ShieldWrapper,
+)
 
 ID = "sidestep/Pursued-v0"
 
@@ -22,4 +26,11 @@ if ID not in gymnasium.registry:
         vector_entry_point="sidestep.bridges.gym.vector:PursuedVectorEnv",
     )
 
-__all__ = ["ID", "PursuedEnv", "PursuedVectorEnv", "SafetyGymnasiumWrapper", "ShieldWrapper"]
+__all__ = [
+    "ID",
+    "PursuedEnv",
+    "PursuedVectorEnv",
+    "SafetyGymnasiumWrapper",
+    "ShieldVectorWrapper",
+    "ShieldWrapper",
+]
