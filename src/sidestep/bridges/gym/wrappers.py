@@ -138,7 +138,9 @@ class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
+        # Gymnasium's wrapper says that one seed is all it takes; the environments take a list as well.
+        inner: Any = self.env
+        observation, info = inner.reset(seed=seed, options=options)
         begun = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), bool)
         if self._memory is None:
             self._memory = _start_all(self.shield, self._worlds_of(self.env))
