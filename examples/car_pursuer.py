@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import sidestep
 from sidestep.safety import grid_barrier, solve_distance
 from sidestep.world import PursuerModel
-from sidestep.world.robots import wheels_from_body, wrap_angle
 
 
 class Car(PursuerModel):
@@ -24,17 +23,10 @@ class Car(PursuerModel):
         return 1.75 * scenario.pursuer_speed, 0.75 * self.radius  # the b at which l_max is largest
 
 
-def chase(scenario, world, key):
-    """Straight at the evader, as far as the car can."""
-    x, y = world.evader - world.pursuer[:2]
-    turn_rate = 4.0 * wrap_angle(jnp.arctan2(y, x) - world.pursuer[2])
-    return wheels_from_body(scenario.pursuer_speed, turn_rate, scenario.pursuer_half_axle)
-
-
 if __name__ == "__main__":
     scenario = sidestep.load_scenario("paper", pursuer_model=Car(), capture_distance=0.15)
     value = solve_distance(scenario, reach=2.0, cells=60)
     print(f"The car can force {value.largest_capture_distance:.3f} m (+- {value.error:.3f})")
     for shield in ("game", grid_barrier(scenario, value)):
-        seen = sidestep.evaluate(scenario, sidestep.goal_seeking, shield, chase, 100, key=0)
+        seen = sidestep.evaluate(scenario, sidestep.goal_seeking, shield, "chauffeur", 100, key=0)
         print(f"{seen.captured} captured, {seen.collided} collided, {seen.reached} of 100 reached")
