@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _LOOK_SECONDS = 1.0
 """How often to look for new and lost workers while no job ends."""
+_RESULT_SECONDS = 60.0
+"""How long a worker may take to hand over a result that it says it has."""
 _MOST_DEATHS = 3
 """Workers that may die under one job."""
 Show = Callable[[int, int, str], None]
@@ -245,8 +247,15 @@ class _Dispatch:
         if future.status in ("cancelled", "lost"):
             raise SchedulerLostError
         if future.status == "finished":
+            # Most workers have put it there themselves. One that died with what it alone had would be waited
+            # for without end: nobody else may run that task.
+            if self.store.read(job.id) is None:
+                try:
+                    self.store.keep(future.result(timeout=_RESULT_SECONDS))
+                except TimeoutError:
+                    self.died(future, job)
+                    return
             del self.at_work[future]
-            self.store.keep(future.result())
             self.done.add(job.id)
             self.outcome.ran = len(self.done)
             return

@@ -25,16 +25,22 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def dask_setup(worker: Any) -> None:
-    """Called in a new local worker: Ctrl-C reaches every process of a terminal, but is the command's."""
+    """Called in a new local worker, before it unpacks anything that imports JAX. Ctrl-C reaches every process
+    of a terminal, but is the command's."""
+    take_cores(worker.state.nthreads, worker.name)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def take_cores(threads: int) -> None:
-    """Have JAX, which must not be imported yet, compute in this many threads and keep compiled programs."""
+def take_cores(threads: int, number: Any = None) -> None:
+    """Have JAX, which must not be imported yet, compute in this many threads and keep compiled programs.
+
+    `number` of a local worker, a whole number: it then keeps to cores of its own, where there are enough.
+    """
     if "jax" in sys.modules:
         return
     keep_compiled_programs()
+    _keep_to_cores(threads, number)
     # As many as XLA makes for its computations; it would take every core of the machine.
     os.environ["NPROC"] = str(threads)
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -44,6 +50,16 @@ def take_cores(threads: int) -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
     # Several workers share an accelerator: none takes all its memory.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
+def _keep_to_cores(threads: int, number: Any) -> None:
+    """XLA's threads wait for work by looking for it again and again: on a core of another worker they take
+    that one's time. Threads that this one starts stay with it."""
+    if not isinstance(number, int) or not hasattr(os, "sched_setaffinity"):
+        return
+    cores = sorted(os.sched_getaffinity(0))[number * threads : (number + 1) * threads]
+    if len(cores) == threads:
+        os.sched_setaffinity(0, cores)
 
 
 def run_on_worker(
@@ -60,7 +76,8 @@ def run_on_worker(
     if sidestep.__version__ != version:
         raise RuntimeError(f"the worker has sidestep {sidestep.__version__}, the command {version}")
     with _ONE_AT_A_TIME:
-        take_cores(get_worker().state.nthreads)
+        worker = get_worker()
+        take_cores(worker.state.nthreads, worker.name)
         return run_once(task, folder, token, run)
 
 
