@@ -12,6 +12,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sidestep.bridges.twin.robots import mjcf_colour
+from sidestep.world.flyers import GRAVITY
+
 ROTORS = ("front_left", "rear_left", "rear_right", "front_right")
 """Clockwise, counter-clockwise and so on, seen from above."""
 
@@ -40,7 +43,7 @@ class Airframe:
             least = 0.0 if name in ("drag", "rotor_torque") else 1e-9
             if not (math.isfinite(value) and value >= least):
                 raise ValueError(f"airframe: {name} = {value!r}: it must be finite and above 0")
-        if 4.0 * self.largest_thrust <= 1.1 * 9.81 * self.mass:
+        if 4.0 * self.largest_thrust <= 1.1 * GRAVITY * self.mass:
             raise ValueError(
                 f"airframe: four rotors of {self.largest_thrust:g} N cannot lift {self.mass:g} kg and steer"
             )
@@ -57,15 +60,10 @@ class Airframe:
         return (1.0, -1.0, 1.0, -1.0)
 
 
-def _rgba(colour: str, alpha: float = 1.0) -> str:
-    channels = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-    return " ".join(f"{channel:.4f}" for channel in (*channels, alpha))
-
-
 def _quadrotor(frame: Airframe, colour: str) -> str:
     rotors = []
     for index, (name, (x, y)) in enumerate(zip(ROTORS, frame.rotor_places, strict=True)):
-        shade = _rgba(colour, 0.55) if index in (0, 3) else "0.25 0.25 0.25 0.55"
+        shade = mjcf_colour(colour, 0.55) if index in (0, 3) else "0.25 0.25 0.25 0.55"
         rotors.append(f"""
       <site name="{name}" pos="{x} {y} 0"/>
       <geom class="shown" type="capsule" fromto="0 0 0 {x} {y} 0" size="0.004" rgba="0.2 0.2 0.2 1"/>
@@ -75,7 +73,7 @@ def _quadrotor(frame: Airframe, colour: str) -> str:
     <body name="quadrotor">
       <freejoint name="quadrotor"/>
       <inertial pos="0 0 0" mass="{frame.mass}" diaginertia="{inertia}"/>
-      <geom class="shown" type="box" size="0.016 0.011 0.009" rgba="{_rgba(colour)}"/>
+      <geom class="shown" type="box" size="0.016 0.011 0.009" rgba="{mjcf_colour(colour)}"/>
       <geom class="shown" type="box" size="0.005 0.004 0.003" pos="0.018 0 0.004" rgba="0.95 0.95 0.95 1"/>\
 {"".join(rotors)}
     </body>"""
@@ -92,13 +90,13 @@ def _rotor_motors(frame: Airframe) -> str:
 
 def _aircraft(index: int, colour: str) -> str:
     """Wings, fuselage and tail; its capture disc is drawn, not modelled."""
-    dark = "0.15 0.15 0.15 1"
+    body, dark = mjcf_colour(colour), "0.15 0.15 0.15 1"
     return f"""
     <body name="pursuer{index}" mocap="true">
-      <geom class="shown" type="capsule" fromto="-0.075 0 0 0.085 0 0" size="0.014" rgba="{_rgba(colour)}"/>
-      <geom class="shown" type="box" size="0.022 0.125 0.0025" pos="0.015 0 0.008" rgba="{_rgba(colour)}"/>
-      <geom class="shown" type="box" size="0.013 0.045 0.002" pos="-0.07 0 0.004" rgba="{_rgba(colour)}"/>
-      <geom class="shown" type="box" size="0.013 0.002 0.02" pos="-0.072 0 0.022" rgba="{_rgba(colour)}"/>
+      <geom class="shown" type="capsule" fromto="-0.075 0 0 0.085 0 0" size="0.014" rgba="{body}"/>
+      <geom class="shown" type="box" size="0.022 0.125 0.0025" pos="0.015 0 0.008" rgba="{body}"/>
+      <geom class="shown" type="box" size="0.013 0.045 0.002" pos="-0.07 0 0.004" rgba="{body}"/>
+      <geom class="shown" type="box" size="0.013 0.002 0.02" pos="-0.072 0 0.022" rgba="{body}"/>
       <geom class="shown" type="ellipsoid" size="0.02 0.009 0.007" pos="0.04 0 0.013" rgba="{dark}"/>
       <geom class="shown" type="cylinder" size="0.032 0.001" pos="0.102 0 0" quat="0.7071 0 0.7071 0"
             rgba="0.15 0.15 0.15 0.35"/>
@@ -108,7 +106,7 @@ def _aircraft(index: int, colour: str) -> str:
 def _column(index: int, radius: float, height: float, colour: str) -> str:
     return f"""
     <body name="obstacle{index}" mocap="true" pos="0 0 {height / 2.0}">
-      <geom class="shown" type="cylinder" size="{radius} {height / 2.0}" rgba="{_rgba(colour)}"/>
+      <geom class="shown" type="cylinder" size="{radius} {height / 2.0}" rgba="{mjcf_colour(colour)}"/>
       <geom class="shown" type="cylinder" size="{radius + 0.004} 0.012" pos="0 0 {height / 2.0 - 0.05}"
             rgba="0.93 0.93 0.93 1"/>
     </body>"""
@@ -134,7 +132,7 @@ def scene_xml(
     bodies += [_aircraft(index, pursuer) for index in range(pursuers)]
     bodies += [_column(index, column_radius, column_height, obstacle) for index in range(obstacles)]
     return f"""<mujoco model="sidestep flight">
-  <option timestep="{physics_step}" integrator="implicitfast" gravity="0 0 -9.81"/>
+  <option timestep="{physics_step}" integrator="implicitfast" gravity="0 0 {-GRAVITY}"/>
   <statistic extent="6" center="1 0 0.5"/>
   <visual>
     <global offwidth="1920" offheight="1200"/>

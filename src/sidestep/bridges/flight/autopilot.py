@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.bridges.flight.airframe import Airframe
+from sidestep.world.flyers import GRAVITY
 
-GRAVITY = 9.81
 Vector = Float[np.ndarray, "3"]
 Matrix = Float[np.ndarray, "3 3"]
 

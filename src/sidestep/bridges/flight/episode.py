@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from sidestep.bridges.flight.flight import Flight
 from sidestep.bridges.flight.options import FlightOptions, budget_of, check_scenario, errors_of
 from sidestep.bridges.onboard import Onboard, OnboardSettings
-from sidestep.bridges.twin.record import Log, PhysicsEpisode, estimate_error, events_of
+from sidestep.bridges.twin.record import (
+    Log,
+    PhysicsEpisode,
+    estimate_error,
+    events_of,
+    periods_of,
+    start_of,
+    steered,
+)
 from sidestep.learning import load_policy
 from sidestep.learning.control_step import decide, decision_steps_of
 from sidestep.learning.records import OUTCOMES
-from sidestep.pursuit import as_pursuer, pursue
+from sidestep.pursuit import as_pursuer
 from sidestep.safety import AdaptedShield, Certificate, Shield, as_shield, certify, make_shield
 from sidestep.safety.certificate import start_margin
-from sidestep.trials.keys import start_and_pursuit
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -146,17 +151,6 @@ class Pilot:
         )
 
 
-@eqx.filter_jit
-def _start(scenario: Scenario, seed: Array) -> Any:
-    start_key, pursuit_key = start_and_pursuit(jax.random.key(seed))
-    return scenario.reset(start_key), pursuit_key
-
-
-@eqx.filter_jit
-def _steer(scenario: Scenario, pursuer: Any, world: World, key: Any, period: Array) -> Array:
-    return pursue(scenario, pursuer, world, jax.random.fold_in(key, period))
-
-
 def certificate_of(scenario: Scenario, options: FlightOptions, **told: Any) -> Certificate:
     """What is guaranteed of the quadrotor's control point, and so of the quadrotor, with these errors.
 
@@ -188,12 +182,10 @@ def fly(
     control.
     """
     scenario, options = pilot.scenario, pilot.options
-    limit = scenario.episode_steps if steps is None else operator.index(steps)
-    if limit < 1:
-        raise ValueError(f"steps = {steps!r}: it must be a whole number of at least 1")
+    limit = periods_of(scenario, steps)
     strategy = as_pursuer(pursuer)
     flight = Flight(scenario, options, seed)
-    drawn, key = _start(scenario, jnp.asarray(seed, jnp.uint32))
+    drawn, key = start_of(scenario, jnp.asarray(seed, jnp.uint32))
     flight.reset(drawn if world is None else world)
     pilot.reset()
     truth = flight.world
@@ -205,7 +197,7 @@ def fly(
         decision = pilot.decide(flight)
         estimate = pilot.onboard.world(now) if options.pursuer_sees == "measurements" else None
         seen = truth if estimate is None else estimate
-        wheels = np.asarray(_steer(scenario, strategy, seen, key, jnp.asarray(count, jnp.uint32)))
+        wheels = np.asarray(steered(scenario, strategy, seen, key, jnp.asarray(count, jnp.uint32)))
         flight.command(decision.velocity, wheels)
         contacts = flight.advance((count + 1) * period - now)
         before, truth = truth, flight.world

@@ -10,7 +10,7 @@ from sidestep.bridges.flight.autopilot import Gains
 from sidestep.bridges.twin import PURSUER_SEES, Sensors, TwinError
 from sidestep.safety import Budget
 from sidestep.world import Scenario
-from sidestep.world.flyers import Quadrotor
+from sidestep.world.flyers import GRAVITY, Quadrotor
 
 ROOM_SENSORS = Sensors(rate=100.0, position_noise=0.001, heading_noise=math.radians(0.25), delay=0.01)
 """Motion capture of a room for small drones."""
@@ -104,7 +104,7 @@ def check_scenario(scenario: Scenario, options: FlightOptions) -> None:
         )
     tilt, most = float(model.largest_tilt(scenario)), options.gains.largest_tilt
     frame = options.airframe
-    lift = 4.0 * frame.largest_thrust * math.cos(tilt) / (9.81 * frame.mass)
+    lift = 4.0 * frame.largest_thrust * math.cos(tilt) / (GRAVITY * frame.mass)
     if tilt >= most or lift <= 1.0:
         why = (
             f"leans {math.degrees(tilt):.0f} degrees, more than largest_tilt = {math.degrees(most):.0f}"

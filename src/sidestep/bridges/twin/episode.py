@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float
 
 from sidestep.bridges.onboard import Onboard, OnboardSettings
 from sidestep.bridges.twin.options import TwinOptions
-from sidestep.bridges.twin.record import Log, PhysicsEpisode, estimate_error, events_of
+from sidestep.bridges.twin.record import (
+    Log,
+    PhysicsEpisode,
+    estimate_error,
+    events_of,
+    periods_of,
+    start_of,
+    steered,
+)
 from sidestep.bridges.twin.twin import Twin
 from sidestep.learning.records import OUTCOMES
-from sidestep.pursuit import Pursuer, as_pursuer, pursue
+from sidestep.pursuit import as_pursuer
 from sidestep.safety import Budget, Shield
-from sidestep.trials.keys import start_and_pursuit
 from sidestep.world import Scenario, World
 
 
@@ -35,17 +39,6 @@ class TwinEpisode(PhysicsEpisode):
     options: TwinOptions
     frames: Float[np.ndarray, "n nq"]
     frame_times: Float[np.ndarray, "n"]
-
-
-@eqx.filter_jit
-def _steer(scenario: Scenario, pursuer: Pursuer, world: World, key: PRNGKeyArray, period: Array) -> Array:
-    return pursue(scenario, pursuer, world, jax.random.fold_in(key, period))
-
-
-@eqx.filter_jit
-def _start(scenario: Scenario, seed: Array) -> tuple[World, PRNGKeyArray]:
-    start_key, pursuit_key = start_and_pursuit(jax.random.key(seed))
-    return scenario.reset(start_key), pursuit_key
 
 
 def settings_for(options: TwinOptions) -> OnboardSettings:
@@ -116,12 +109,10 @@ def twin_episode(
     **Raises** `ValueError` as `evaluate`, and `TwinError` when MuJoCo is missing.
     """
     scenario = onboard.scenario
-    limit = scenario.episode_steps if steps is None else operator.index(steps)
-    if limit < 1:
-        raise ValueError(f"steps = {steps!r}: it must be a whole number of at least 1")
+    limit = periods_of(scenario, steps)
     strategy = as_pursuer(pursuer)
     twin = Twin(scenario, options, seed)
-    drawn, key = _start(scenario, jnp.asarray(seed, jnp.uint32))
+    drawn, key = start_of(scenario, jnp.asarray(seed, jnp.uint32))
     twin.reset(drawn if world is None else world)
     onboard.reset()
     truth = twin.world
@@ -136,7 +127,7 @@ def twin_episode(
         seen = truth
         if twin.options.pursuer_sees == "measurements" and decision.world is not None:
             seen = decision.world
-        wheels = np.asarray(_steer(scenario, strategy, seen, key, jnp.asarray(count, jnp.uint32)))
+        wheels = np.asarray(steered(scenario, strategy, seen, key, jnp.asarray(count, jnp.uint32)))
         twin.command(decision.velocity, wheels)
         contacts = twin.advance((count + 1) * period - now)
         before, truth = truth, twin.world

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Any, final
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep.bridges.onboard import Decision
 from sidestep.bridges.twin.contacts import Contacts
+from sidestep.pursuit import Pursuer, pursue
 from sidestep.safety import Status
 from sidestep.trials import Trajectory
+from sidestep.trials.keys import start_and_pursuit
 from sidestep.world import Events, Scenario, World
 
 
@@ -73,6 +77,27 @@ class PhysicsEpisode:
 
 def _finite(distance: float) -> float | None:
     return distance if np.isfinite(distance) else None
+
+
+def periods_of(scenario: Scenario, steps: int | None) -> int:
+    """How many control periods to play at most. **Raises** `ValueError` for fewer than one."""
+    limit = scenario.episode_steps if steps is None else operator.index(steps)
+    if limit < 1:
+        raise ValueError(f"steps = {steps!r}: it must be a whole number of at least 1")
+    return limit
+
+
+@eqx.filter_jit
+def start_of(scenario: Scenario, seed: Array) -> tuple[World, PRNGKeyArray]:
+    """The start that `rollout` has with this seed, and the key of its pursuers."""
+    start_key, pursuit_key = start_and_pursuit(jax.random.key(seed))
+    return scenario.reset(start_key), pursuit_key
+
+
+@eqx.filter_jit
+def steered(scenario: Scenario, pursuer: Pursuer, world: World, key: PRNGKeyArray, period: Array) -> Array:
+    """What every pursuer does in a period, (m, 2) m/s."""
+    return pursue(scenario, pursuer, world, jax.random.fold_in(key, period))
 
 
 def events_of(scenario: Scenario, world: World, contacts: Contacts, last: bool) -> dict[str, Any]:

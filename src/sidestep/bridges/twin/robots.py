@@ -32,7 +32,8 @@ _MOTOR_ARMATURE = 0.001
 _PURSUER_ACCELERATION = 4.0
 
 
-def _rgba(colour: str, alpha: float = 1.0) -> str:
+def mjcf_colour(colour: str, alpha: float = 1.0) -> str:
+    """A colour `#rrggbb` as MJCF wants it."""
     channels = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
     return " ".join(f"{channel:.4f}" for channel in (*channels, alpha))
 
@@ -64,7 +65,7 @@ def pursuer_body(index: int, half_axle: float, colour: str) -> str:
     <body name="pursuer{index}" pos="0 0 {WHEEL_RADIUS}">
       <freejoint name="pursuer{index}"/>
       <geom class="shown" type="box" size="{length} {width} 0.025" pos="0 0 0.008" mass="{_CHASSIS_MASS}"
-            rgba="{_rgba(colour)}"/>
+            rgba="{mjcf_colour(colour)}"/>
       <geom class="shown" type="box" size="{0.16 * length} {0.6 * width} 0.008" pos="{0.75 * length} 0 0.036"
             rgba="0.95 0.95 0.95 1"/>
       <geom class="shown" type="cylinder" size="{0.3 * width} 0.012" pos="0 0 0.042"
@@ -88,7 +89,7 @@ def evader_body(base: str, colour: str) -> str:
     """The omnidirectional evader on its planar joints or on its wheels."""
     top = f"""
       <geom class="shown" type="cylinder" size="{EVADER_RADIUS} 0.03" pos="0 0 {{deck}}"
-            rgba="{_rgba(colour)}"/>
+            rgba="{mjcf_colour(colour)}"/>
       <geom class="shown" type="cylinder" size="{0.7 * EVADER_RADIUS} 0.006" pos="0 0 {{lid}}"
             rgba="0.95 0.95 0.95 1"/>
       <geom class="shown" type="box" size="0.018 0.005 0.007" pos="{0.5 * EVADER_RADIUS} 0 {{lid}}"
@@ -165,7 +166,7 @@ def obstacle_body(index: int, colour: str) -> str:
       <inertial pos="0 0 0.06" mass="2" diaginertia="0.01 0.01 0.01"/>
       <joint name="obstacle{index}_x" type="slide" axis="1 0 0"/>
       <joint name="obstacle{index}_y" type="slide" axis="0 1 0"/>
-      <geom class="shown" type="cylinder" size="0.06 0.06" pos="0 0 0.06" rgba="{_rgba(colour)}"/>
+      <geom class="shown" type="cylinder" size="0.06 0.06" pos="0 0 0.06" rgba="{mjcf_colour(colour)}"/>
       <geom class="shown" type="cylinder" size="0.061 0.008" pos="0 0 0.095" rgba="0.93 0.93 0.93 1"/>
     </body>"""
 
