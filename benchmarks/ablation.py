@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sidestep._compiled import thread_limits
+
 EVALUATION_SEED = 1000
 """Of the episodes in which trained policies are compared; trainings use small seeds of their own."""
 
@@ -81,7 +83,7 @@ def one_training(
     study: str, variant: str, seed: int, episodes: int, hidden: list[int], shield: str, evaluated: int
 ) -> dict[str, Any]:
     """Train once on one core and say how it went, also with the trained policy in `evaluated` episodes."""
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ.update(thread_limits(1))
     from sidestep.learning import make_options, train
     from sidestep.trials import evaluate
     from sidestep.world import load_scenario

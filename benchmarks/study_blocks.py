@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sidestep._compiled import thread_limits
+
 
 def results(run_block: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterator[Any]:
     """`run_block` of every job, as they are done: here with one process, else in as many of one core each."""
     if processes == 1:
         yield from map(run_block, jobs)
         return
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ.update(thread_limits(1))
     with multiprocessing.get_context("spawn").Pool(processes, _alone) as pool:
         yield from pool.imap_unordered(run_block, jobs)
 

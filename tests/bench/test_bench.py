@@ -107,7 +107,7 @@ def test_a_case_runs_in_a_process_of_its_own_and_survives_what_its_library_print
     )
     assert figures["latency"]["count"] == 2
     assert figures["environment"]["OMP_NUM_THREADS"] == "1"
-    assert "--xla_cpu_multi_thread_eigen=false" in figures["environment"]["XLA_FLAGS"]
+    assert figures["environment"]["PJRT_NPROC"] == "1"
     failed = run_case(Case("startup", "none", {"command": "no such command"}))
     assert "no such command" in failed["error"]
 

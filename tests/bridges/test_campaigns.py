@@ -275,9 +275,9 @@ def test_cores_are_taken_before_jax_is_there_and_never_after():
         "import os, sys\n"
         "from sidestep.bridges.campaigns.worker import take_cores\n"
         "assert 'jax' not in sys.modules\n"
-        "take_cores(3); first = os.environ['NPROC']\n"
+        "take_cores(3); first = os.environ['PJRT_NPROC']\n"
         "sys.modules['jax'] = os\n"
-        "take_cores(1); print(first, os.environ['NPROC'])\n"
+        "take_cores(1); print(first, os.environ['PJRT_NPROC'])\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split() == ["3", "3"], done.stderr

@@ -11,6 +11,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from sidestep._compiled import thread_limits
 from sidestep_ros.parameters import ConfigurationError
 
 _LOOK_AROUND = 0.1
@@ -23,7 +24,8 @@ def tune_jax() -> None:
     asks computes: waking another takes longer than most decisions.
     """
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    for name, value in thread_limits(1).items():
+        os.environ.setdefault(name, value)
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -113,8 +113,7 @@ def environment(tmp_path_factory):
     return {
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "XLA_FLAGS": "--xla_backend_optimization_level=1 --xla_cpu_multi_thread_eigen=false "
-        "intra_op_parallelism_threads=1",
+        "XLA_FLAGS": "--xla_backend_optimization_level=1",
     }
 
 

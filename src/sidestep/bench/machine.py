@@ -10,14 +10,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from sidestep._compiled import thread_limits
+
 PACKAGES = (
     "sidestep", "jax", "jaxlib", "equinox", "optax", "numpy", "scipy", "torch", "stable-baselines3", "sbx-rl",
     "flax", "rejax", "gymnax", "gymnasium", "cbfpy", "qpax", "elastiqp", "osqp", "clarabel",
 )  # fmt: skip
 """Packages whose versions are written down."""
 THREAD_SETTINGS = (
-    "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS", "JAX_PLATFORMS",
-    "JAX_ENABLE_X64",
+    "PJRT_NPROC", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS",
+    "JAX_PLATFORMS", "JAX_ENABLE_X64",
 )  # fmt: skip
 """Environment variables that decide how many threads there are, and which precision."""
 
@@ -77,11 +79,7 @@ def thread_environment(threads: int, **more: str) -> dict[str, str]:
     # What the caller's shell sets must not slow one side down.
     for name in ("XLA_FLAGS", "JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "JAX_NUMPY_DTYPE_PROMOTION"):
         settings.pop(name, None)
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        settings[name] = str(threads)
-    if threads == 1:
-        settings["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    return {**settings, **more}
+    return {**settings, **thread_limits(threads), **more}
 
 
 def synchronous_dispatch() -> None:

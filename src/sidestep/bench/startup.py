@@ -14,7 +14,7 @@ from sidestep.bench.children import Case
 from sidestep.bench.machine import peak_memory_of_children_mib
 from sidestep.bench.timing import spread
 
-CLI = ["-m", "sidestep.cli"]
+CLI = ["-m", "sidestep"]
 COMMANDS: dict[str, list[str]] = {
     "python -c pass": ["-c", "pass"],
     "import jax": ["-c", "import jax"],

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sidestep._compiled import keep_compiled_programs
+from sidestep._compiled import keep_compiled_programs, thread_limits
 
 if TYPE_CHECKING:
     from sidestep.trials.campaign import Task
@@ -41,13 +41,7 @@ def take_cores(threads: int, number: Any = None) -> None:
         return
     keep_compiled_programs()
     _keep_to_cores(threads, number)
-    # As many as XLA makes for its computations; it would take every core of the machine.
-    os.environ["NPROC"] = str(threads)
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[name] = str(threads)
-    if threads == 1:
-        flags = os.environ.get("XLA_FLAGS", "")
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+    os.environ.update(thread_limits(threads))
     # Several workers share an accelerator: none takes all its memory.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
