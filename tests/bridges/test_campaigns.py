@@ -313,6 +313,7 @@ def test_campaign_from_the_command_line(tmp_path, capsys):
     file.write_text(FILE)
     arguments = ["campaign", str(file), "--out", str(out)]
     assert main([*arguments, "--dry-run"]) == 0
+    assert main([*arguments, "--dry-run", "--workers", "0"]) == 2
     assert "4 jobs, 0 of them done" in capsys.readouterr().out
     assert not out.exists()
     report = tmp_path / "deep" / "report.json"

@@ -114,3 +114,8 @@ def test_several_pursuers_share_what_the_evader_loses_and_each_has_its_own_wheel
     np.testing.assert_allclose(went, (0.2 * 0.05, 0.0), atol=1e-5)
     with pytest.raises(ValueError, match="pursuer_1"):
         env.step({"evader": STOP, "pursuer_0": FULL})
+
+
+def test_a_strategy_for_the_pursuers_is_refused():
+    with pytest.raises(ValueError, match="learners"):
+        duel.DuelEnv(pursuer="nash")

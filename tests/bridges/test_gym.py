@@ -27,6 +27,7 @@ from sidestep.bridges.gym import (
     ShieldWrapper,
 )
 from sidestep.bridges.gym.calls import seed_words
+from sidestep.bridges.gym.wrappers import checked_shield
 from sidestep.safety import Status, make_shield
 from sidestep.trials import evaluate
 from sidestep.world import (
@@ -235,11 +236,32 @@ def test_a_wrong_argument_is_named(wrong, named):
         ({**SCENE, "target": (np.nan, 0.0)}, "'target'"),
         ({name: SCENE[name] for name in ("evader", "target")}, "'pursuers'"),
         ("here", "a World"),
+        ({**SCENE, "evader": SCENE["pursuers"][0][:2]}, "captured, 0 m from pursuer 0"),
+        ({**SCENE, "evader": SCENE["obstacles"][0][:2]}, "in collision, 0 m from obstacle 0"),
     ],
 )
 def test_a_start_that_is_no_world_is_named(world, named):
     with pytest.raises(ValueError, match=named):
         chasing().reset(options={"world": world})
+
+
+def test_options_that_reset_would_not_heed_are_refused():
+    with pytest.raises(ValueError, match=r"\['wrold'\]; reset knows 'world'"):
+        chasing().reset(options={"wrold": SCENE})
+    vector = gymnasium.make_vec(ID, 2, **TASK)
+    with pytest.raises(ValueError, match="'world', 'reset_mask'"):
+        vector.reset(options={"mask": np.ones(2, bool)})
+    worlds = {name: np.stack([part, part]) for name, part in SCENE.items()}
+    worlds["evader"] = np.stack([SCENE["evader"], SCENE["pursuers"][0][:2]])
+    with pytest.raises(ValueError, match="captured in world 1"):
+        vector.reset(options={"world": worlds})
+    with pytest.raises(ValueError, match="'NextStep', 'SameStep', 'Disabled'"):
+        gymnasium.make_vec(ID, 2, **TASK, autoreset_mode="same")
+
+
+def test_a_shields_name_does_not_say_which_robots_it_guards():
+    with pytest.raises(ValueError, match=r"make_shield\('game', scenario\)"):
+        checked_shield("game")
 
 
 def test_actions_of_a_wrong_shape_are_not_stretched_to_fit():

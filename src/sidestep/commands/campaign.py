@@ -49,6 +49,9 @@ def run(command: Campaign, console: Console) -> int:
     plan = load_campaign(command.file)
     folder = command.out or Path("runs") / command.file.stem
     if command.dry_run:
+        from sidestep.bridges.campaigns.cluster import check_options
+
+        check_options(command.scheduler, command.workers, command.threads_per_worker)
         done = sum(Store(folder).read(job.id) is not None for job in plan.jobs)
         console.print(f"{plan.name}: {len(plan.jobs)} jobs, {done} of them done in {folder}", highlight=False)
         return 0
@@ -125,6 +128,8 @@ def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Con
     words = ["sidestep", "campaign", str(command.file), "--out", str(folder)]
     if command.scheduler != "local":
         words += ["--scheduler", command.scheduler]
+    for option, value in (("workers", command.workers), ("threads-per-worker", command.threads_per_worker)):
+        words += [] if value is None else [f"--{option}", str(value)]
     reason = "Jobs failed" if outcome.stopped is None else outcome.stopped[0].upper() + outcome.stopped[1:]
     say(f"{reason}. What is done stays done; go on with: {shlex.join(words)}")
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sidestep.bridges.campaigns.cluster import LOCAL, connected, local_size, name_of
+from sidestep.bridges.campaigns.cluster import LOCAL, check_options, connected, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
 from sidestep.bridges.packages import needed
 
@@ -99,8 +99,7 @@ def run_campaign(
 
     for package in ("distributed", "pyarrow"):
         needed(package, "cluster", "campaigns need")
-    if scheduler == LOCAL:
-        local_size(workers, threads_per_worker)
+    check_options(scheduler, workers, threads_per_worker)
     store = Store(folder)
     with store.alone():
         store.begin(campaign.name, campaign.text)

@@ -35,6 +35,19 @@ def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:
     return workers, threads or max(1, cores() // workers)
 
 
+def check_options(scheduler: Any, workers: int | None, threads: int | None) -> None:
+    """**Raises** `ValueError` for options that are wrong or do not go together; asks nobody."""
+    if scheduler == LOCAL:
+        local_size(workers, threads)
+        return
+    if isinstance(scheduler, str) and "://" not in scheduler:
+        raise ValueError(f"scheduler = '{scheduler}': it must be local or an address such as tcp://host:8786")
+    if workers is not None or threads is not None:
+        raise ValueError(
+            "--workers and --threads-per-worker are for --scheduler local; a cluster has its own"
+        )
+
+
 def name_of(scheduler: Any) -> str:
     """The address of a scheduler or cluster, for messages."""
     return (
@@ -52,16 +65,11 @@ def connected(scheduler: Any, workers: int | None, threads: int | None) -> Itera
     **Raises** `ValueError` when nothing answers at the address, or for options that do not go together.
     """
     distributed: Any = needed("distributed", "cluster", "campaigns need")
+    check_options(scheduler, workers, threads)
     if scheduler == LOCAL:
         with _local(distributed, *local_size(workers, threads)) as client:
             yield client
         return
-    if isinstance(scheduler, str) and "://" not in scheduler:
-        raise ValueError(f"scheduler = '{scheduler}': it must be local or an address such as tcp://host:8786")
-    if workers is not None or threads is not None:
-        raise ValueError(
-            "--workers and --threads-per-worker are for --scheduler local; a cluster has its own"
-        )
     if isinstance(scheduler, str):
         _check_reachable(scheduler)
     try:

@@ -137,6 +137,8 @@ class DuelEnv(pettingzoo.ParallelEnv):
         render_mode: str | None = None,
         **fields: Any,
     ):
+        if "pursuer" in fields:
+            raise ValueError("pursuer: here the pursuers are learners; PursuedEnv has one that is not")
         self.render_mode = check_render_mode(render_mode)
         self.task = make_task(scenario, shield, "still", decision_steps, reward_scale, **fields)
         self.scenario = self.task.scenario
@@ -189,6 +191,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
             self._words, self._number = seed_words([seed])[:, 0], -1
         self._number += 1
         number = np.asarray(self._number, np.int32)
+        # Others mean nothing here, and PettingZoo's own tests hand some over.
         if options and "world" in options:
             leaves, structure = jax.tree.flatten(given_world(self.scenario, options["world"]))
             made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)

@@ -14,7 +14,7 @@ from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
-from sidestep.bridges.gym.worlds import given_world
+from sidestep.bridges.gym.worlds import checked_options, given_world
 from sidestep.world import World
 
 
@@ -117,13 +117,14 @@ class PursuedEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
+        told = checked_options(options, "world")
         super().reset(seed=seed)
         if seed is not None or self._number < 0:
             self._words, self._number = seed_words([self.np_random_seed])[:, 0], -1
         self._number += 1
         number = np.asarray(self._number, np.int32)
-        if options and "world" in options:
-            world = given_world(self.scenario, options["world"])
+        if "world" in told:
+            world = given_world(self.scenario, told["world"])
             leaves, structure = jax.tree.flatten(world)
             made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
         else:

@@ -17,7 +17,7 @@ from sidestep.bridges.gym.fleet import AHEAD, Fleet, Spares
 from sidestep.bridges.gym.rendering import Picture, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
-from sidestep.bridges.gym.worlds import given_world
+from sidestep.bridges.gym.worlds import checked_options, given_world
 from sidestep.world import World
 
 _DRAWN_AT_ONCE = 256
@@ -96,7 +96,11 @@ class PursuedVectorEnv(VectorEnv):
         super().__init__()
         self.render_mode = check_render_mode(render_mode)
         self.num_envs = int(num_envs)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode = {autoreset_mode!r}: it must be one of {modes}") from None
         self.task = make_task(scenario, shield, pursuer, decision_steps, reward_scale, **fields)
         self.scenario = self.task.scenario
         self.metadata = {
@@ -134,9 +138,11 @@ class PursuedVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        options = options or {}
-        if "reset_mask" in options:
-            return self._reset_some(seed, options["reset_mask"])
+        told = checked_options(options, "world", "reset_mask")
+        if "reset_mask" in told:
+            if "world" in told:
+                raise ValueError("options: 'world' starts all worlds anew and takes no 'reset_mask'")
+            return self._reset_some(seed, told["reset_mask"])
         fresh = self._seed(seed)
         self._numbers = np.where(fresh, 0, self._numbers + 1).astype(np.int32)
         self._drawn = self._numbers.copy()
@@ -145,8 +151,8 @@ class PursuedVectorEnv(VectorEnv):
         fleet = jax.eval_shape(fleets.launch, self.task, self._words, self._numbers)
         spares = bundle_of(jax.eval_shape(fleets.no_spares, fleet))
         self._layouts = self._layout, jax.tree.structure(fleet), spares
-        if "world" in options:
-            world = given_world(self.scenario, options["world"], (self.num_envs,))
+        if "world" in told:
+            world = given_world(self.scenario, told["world"], (self.num_envs,))
             leaves, structure = jax.tree.flatten(world)
             place = flat(_place, *self._layouts[:2], structure)
             self._fleet, observation = place((self._task, self._now(), leaves))

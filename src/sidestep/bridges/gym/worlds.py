@@ -14,13 +14,22 @@ from sidestep.world import Scenario, World
 _PARTS = ("evader", "pursuers", "obstacles", "target")
 
 
+def checked_options(options: Any, *known: str) -> dict[str, Any]:
+    """What `reset` was told. **Raises** `ValueError` for anything that it would not heed."""
+    options = {} if options is None else options
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        raise ValueError(f"options has {unknown}; reset knows {', '.join(map(repr, known))}")
+    return options
+
+
 def given_world(scenario: Scenario, given: Any, lanes: tuple[int, ...] = ()) -> World:
     """The world of `options={"world": ...}`: a `World`, or a mapping of `evader` (2,), `pursuers` (m, 3),
     `obstacles` (k, 4) and `target` (2,), each with an axis of worlds in front if there are several. It starts
     at time 0.
 
     **Returns** it in lanes if there are several. **Raises** `ValueError` naming the part that is missing,
-    has the wrong shape or is not finite.
+    has the wrong shape or is not finite, and for an evader that is captured or collides to begin with.
     """
     if not isinstance(given, (World, Mapping)):
         raise ValueError(f"options['world'] must be a World or a mapping, not a {type(given).__name__}")
@@ -41,7 +50,24 @@ def given_world(scenario: Scenario, given: Any, lanes: tuple[int, ...] = ()) -> 
             raise ValueError(
                 f"options['world']: {name!r} must be {wanted} finite numbers, not {parts[name].shape}"
             )
+    _check_contacts(scenario, parts)
     if not lanes:
         return World(**parts)
     worlds = jax.vmap(World)(**{name: jnp.asarray(part, dtype=float) for name, part in parts.items()})
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), worlds)
+
+
+def _check_contacts(scenario: Scenario, parts: Mapping[str, np.ndarray]) -> None:
+    for name, distance, outcome in (
+        ("pursuers", float(scenario.capture_distance), "captured"),
+        ("obstacles", float(scenario.collision_distance), "in collision"),
+    ):
+        apart = np.hypot(*np.moveaxis(parts[name][..., :2] - parts["evader"][..., None, :], -1, 0))
+        touched = np.argwhere(apart <= distance)
+        if len(touched):
+            *world, number = touched[0]
+            where = f" in world {world[0]}" if world else ""
+            raise ValueError(
+                f"options['world']: the evader starts {outcome}{where}, {apart[tuple(touched[0])]:.3g} m "
+                f"from {name[:-1]} {number}; {distance:.3g} m is contact"
+            )

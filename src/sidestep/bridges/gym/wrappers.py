@@ -22,6 +22,17 @@ def in_lanes(worlds: World) -> World:
     return jax.tree.map(lambda leaf: jnp.moveaxis(real(leaf), 0, -1), worlds)
 
 
+def checked_shield(shield: Any) -> Shield:
+    """**Raises** `ValueError` for anything but a shield: a name alone does not say for which robots."""
+    if isinstance(shield, Shield):
+        return shield
+    name = shield if isinstance(shield, str) else "joint"
+    raise ValueError(
+        f"shield = {shield!r}: it must be a sidestep.Shield, such as make_shield({name!r}, scenario) with "
+        "the Scenario of the robots in this environment"
+    )
+
+
 def _call(shield: Shield, world: World, nominal: Any, memory: Any) -> Any:
     return shield(world, nominal, memory)
 
@@ -47,6 +58,8 @@ class ShieldWrapper(gymnasium.Wrapper):
 
     `info` gains `proposed` and `executed` (actions), `status` (see `sidestep.safety.Status`) and
     `intervention` (m/s). Learners that store `proposed`, their own action, learn what a correction leads to.
+
+    **Raises** `ValueError` for a shield's name, and for a velocity of another shape.
     """
 
     def __init__(
@@ -59,7 +72,7 @@ class ShieldWrapper(gymnasium.Wrapper):
         action_of: Callable[[np.ndarray, World], Any] | None = None,
     ):
         super().__init__(env)
-        self.shield, self._world_of = shield, world_of
+        self.shield, self._world_of = checked_shield(shield), world_of
         self._velocity_of = velocity_of or (lambda action, world: action)
         self._action_of = action_of or (lambda velocity, world: velocity)
         self._filter, self._start = eqx.filter_jit(_call), eqx.filter_jit(_init)
@@ -115,7 +128,7 @@ class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
     the shield leaves as they are go through untouched; what a shield remembers of a world is forgotten when
     an episode begins there, in each of the three autoreset modes.
 
-    **Raises** `ValueError` for velocities of another shape.
+    **Raises** `ValueError` for a shield's name, and for velocities of another shape.
     """
 
     def __init__(
@@ -128,7 +141,7 @@ class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
         actions_of: Callable[[np.ndarray, World], Any] | None = None,
     ):
         super().__init__(env)
-        self.shield, self._worlds_of = shield, worlds_of
+        self.shield, self._worlds_of = checked_shield(shield), worlds_of
         self._velocities_of = velocities_of or (lambda actions, worlds: actions)
         self._actions_of = actions_of or (lambda velocities, worlds: velocities)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
