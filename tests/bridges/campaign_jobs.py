@@ -27,6 +27,15 @@ def runs(log: Path) -> list[int]:
     return [int(line) for line in log.read_text().split()] if log.exists() else []
 
 
+class Fatal(str):
+    """Words that can be written down, but that nobody can hand over and live."""
+
+    __slots__ = ()
+
+    def __reduce__(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
 def stand_in(task, folder):
     """Each run appends a line to a log, then does what it is told."""
     settings = task.settings
@@ -41,6 +50,8 @@ def stand_in(task, folder):
         raise ArithmeticError("two and two")
     if does == "lasts":
         time.sleep(0.25)
+    if does == "dies_handing_over":
+        return {"said": Fatal("farewell")}
     return {"seed_squared": settings["seed"] ** 2, "pair": {"a": 1.5, "b": None}}
 
 

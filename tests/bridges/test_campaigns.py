@@ -72,6 +72,49 @@ def test_killed_worker_costs_no_result_and_no_job_a_second_result(stand_ins, tmp
     assert len({row["process"] for row in table} - {os.getpid()}) >= 2
 
 
+def test_result_that_a_worker_wrote_but_never_handed_over_counts(stand_ins, tmp_path):
+    """Dask says that the job is finished, and then waits for a dead worker's answer without end."""
+    log, out, outcomes = tmp_path / "log", tmp_path / "out", []
+    campaign = stand_ins.make_campaign(log, 3, dies_handing_over=[1])
+
+    def call():
+        outcomes.append(run_campaign(campaign, out, workers=1, run=stand_ins.stand_in))
+
+    caller = threading.Thread(target=call, daemon=True)
+    caller.start()
+    caller.join(60.0)
+    assert outcomes, "it still waits"
+    assert outcomes[0].complete
+    assert sorted(stand_ins.runs(log)) == [0, 1, 2]
+
+
+def test_result_that_nobody_hands_over_is_made_again(stand_ins, tmp_path):
+    campaign, store = stand_ins.make_campaign(tmp_path / "log", 1), Store(tmp_path / "out")
+    store.begin("stand-ins", "")
+    (job,) = campaign.jobs
+    outcome = campaign_module.CampaignOutcome(1, 0)
+    dispatch = campaign_module._Dispatch(None, store, outcome, campaign_module._quiet, None)
+
+    class Silent:
+        status = "finished"
+
+        def result(self, timeout):
+            raise TimeoutError
+
+        def cancel(self):
+            pass
+
+    for left in (2, 1, 0):
+        assert not dispatch.waiting
+        future = Silent()
+        dispatch.at_work[future] = (job, "tcp://gone")
+        dispatch.take(future)
+        assert not dispatch.at_work
+        if left:
+            assert dispatch.waiting.next_for("tcp://other") == job
+    assert [failure.job for failure in outcome.failed] == [job]
+
+
 def test_job_that_kills_every_worker_fails_alone(stand_ins, tmp_path, monkeypatch):
     monkeypatch.setattr(campaign_module, "_MOST_DEATHS", 2)
     log, out = tmp_path / "log", tmp_path / "out"
