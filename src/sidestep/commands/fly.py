@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from sidestep.commands.common import (
-    CountBar,
     Overrides,
     PursuerName,
     ScenarioName,
@@ -18,10 +17,20 @@ from sidestep.commands.common import (
     policy_and_scenario,
     write_json_file,
 )
-from sidestep.commands.twin import episode_table, twin_counts
+from sidestep.commands.physics import (
+    about_of,
+    check_amounts,
+    draw_beside_simulation,
+    episode_table,
+    outcome_counts,
+    play_seeds,
+    setting,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from sidestep.bridges.flight import FlightEpisode
 
 
 _NEAR = 2.0
@@ -72,21 +81,15 @@ class Fly:
 
 def run(command: Fly, console: Console) -> int:
     """Run `sidestep fly`; returns the exit status."""
-    import warnings
-
     from sidestep.bridges.flight import ROOM_SENSORS, FlightOptions, Pilot, certificate_of, fly, write_video
     from sidestep.bridges.twin import changed_sensors
-    from sidestep.safety.budget import BudgetWarning
 
-    if command.seeds < 1:
-        raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
+    check_amounts(command)
     if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:
         raise ValueError(
             f"rate = {command.rate}, width = {command.width}: the rate must be at least 1, the width an even "
             "number from 64 to 1920"
         )
-    if not command.speed > 0.0:
-        raise ValueError(f"speed = {command.speed}: it must be greater than 0")
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     options = FlightOptions(
         sensors=changed_sensors(ROOM_SENSORS, parse_overrides(command.noise)),
@@ -94,58 +97,47 @@ def run(command: Fly, console: Console) -> int:
         wind=command.wind,
         pursuer_sees=command.pursuer_sees,
     )
-    figures: list[dict[str, Any]] = []
-    first, interrupted = None, False
-    with (
-        warnings.catch_warnings(record=True) as warned,
-        CountBar(console, f"{command.shield} shield, {command.pursuer}, quadrotor") as show,
-    ):
-        warnings.simplefilter("always", BudgetWarning)
+
+    def prepare() -> Pilot:
         pilot = Pilot(scenario, policy, command.shield, options)
-        certificate = certificate_of(scenario, options, check_shield=False)
         pilot.onboard.warm_up()
-        try:
-            for number in range(command.seeds):
-                flight = fly(
-                    pilot, command.pursuer, command.seed + number, command.steps, certificate=certificate
-                )
-                first = first or flight
-                figures.append(flight.to_dict())
-                show(number + 1, command.seeds)
-        except KeyboardInterrupt:
-            interrupted = True
-            if first is None:
-                raise
-    assert first is not None
-    for text in dict.fromkeys(str(one.message) for one in warned):
-        console.print(f"Warning: {text}.", highlight=False)
-    _print(figures, certificate, scenario, console)
+        return pilot
+
+    def play(pilot: Pilot, seed: int) -> FlightEpisode:
+        return fly(pilot, command.pursuer, seed, command.steps, certificate=certificate)
+
+    certificate = certificate_of(scenario, options, check_shield=False)
+    played = play_seeds(command, "quadrotor", prepare, play, console)
+    counts = flight_counts(played.figures)
+    episode_table(played.figures, "flights", console)
+    _say(counts, certificate, console)
     report = {
-        "policy": command.run,
-        "shield": command.shield,
-        "pursuer": command.pursuer,
-        **_setting(scenario, options, certificate),
-        **flight_counts(figures),
-        "flights": figures,
+        **setting(command, scenario, options),
+        **_promised(options, certificate),
+        **counts,
+        "flights": played.figures,
     }
     write_json_file(command.json, report)
-    if interrupted:
-        console.print(f"Interrupted: {len(figures)} of {command.seeds} flights.", highlight=False)
+    if played.interrupted:
+        console.print(f"Interrupted: {len(played.figures)} of {command.seeds} flights.", highlight=False)
         return 130
     if command.out is not None:
-        _draw(command, scenario, policy, pilot.shield, first, command.out, console)
+        draw_beside_simulation(
+            command, policy, played.player.shield, played.first, command.out / "flight",
+            about_of(command, "sidestep fly"), console, twin_words="quadrotor in MuJoCo", near=_NEAR,
+        )  # fmt: skip
     if command.video is not None:
         size = (round(command.width * 9 / 32) * 2, command.width)
-        path = write_video(first, command.video, speed=command.speed, rate=command.rate, size=size)
+        path = write_video(played.first, command.video, speed=command.speed, rate=command.rate, size=size)
         console.print(f"Video: {path}", soft_wrap=True)
     return 0
 
 
 def flight_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
-    """As `twin_counts`, with how many flights kept within the certificate's assumptions, and how many of
+    """As `outcome_counts`, with how many flights kept within the certificate's assumptions, and how many of
     those were lost."""
     inside = [figure for figure in figures if figure["within_assumptions"]]
-    return twin_counts(figures) | {
+    return outcome_counts(figures) | {
         "within_assumptions": len(inside),
         "lost_within_assumptions": sum(one["outcome"] in ("captured", "collided") for one in inside),
         "infeasible_periods": sum(figure["infeasible_periods"] for figure in figures),
@@ -154,16 +146,10 @@ def flight_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _setting(scenario: Any, options: Any, certificate: Any) -> dict[str, Any]:
-    import importlib.metadata
-    from dataclasses import asdict
-
+def _promised(options: Any, certificate: Any) -> dict[str, Any]:
     from sidestep.bridges.flight import errors_of
-    from sidestep.world import scenario_to_dict
 
     return {
-        "scenario": scenario_to_dict(scenario),
-        "options": asdict(options),
         "budget": errors_of(options),
         "certificate": {
             "guaranteed": certificate.guaranteed,
@@ -172,18 +158,15 @@ def _setting(scenario: Any, options: Any, certificate: Any) -> dict[str, Any]:
             "parts": certificate.budget,
             "stands_for": certificate.situation.stands_for,
         },
-        "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "mujoco", "jax")},
     }
 
 
-def _print(figures: list[dict[str, Any]], certificate: Any, scenario: Any, console: Console) -> None:
-    episode_table(figures, "flights", console)
-    counts = flight_counts(figures)
+def _say(counts: dict[str, Any], certificate: Any, console: Console) -> None:
     if certificate.guaranteed:
         kept = certificate.guaranteed_clearance - certificate.situation.capture_distance
         console.print(
             f"Capture is excluded by the certificate, with {1e3 * kept:.0f} mm to spare. Within its "
-            f"assumptions: {counts['within_assumptions']} of {len(figures)} flights, of which "
+            f"assumptions: {counts['within_assumptions']} of {counts['episodes']} flights, of which "
             f"{counts['lost_within_assumptions']} were captured or collided.",
             highlight=False,
         )
@@ -194,20 +177,3 @@ def _print(figures: list[dict[str, Any]], certificate: Any, scenario: Any, conso
         f"{counts['infeasible_periods']} periods in which not every row could be kept.",
         highlight=False,
     )
-
-
-def _draw(
-    command: Fly, scenario: Any, policy: Any, shield: Any, flight: Any, folder: Path, console: Console
-) -> None:
-    from sidestep.trials import rollout, save_trajectory
-    from sidestep.views import twin_figure
-
-    simulation = rollout(scenario, policy, shield, command.pursuer, flight.seed, steps=command.steps)
-    folder.mkdir(parents=True, exist_ok=True)
-    about = {"shield": command.shield, "pursuer": command.pursuer, "source": "sidestep fly"}
-    save_trajectory(folder / "flight.npz", flight.trajectory, scenario, about)
-    png, pdf = twin_figure(
-        scenario, simulation, flight.trajectory, folder / "flight", shield=command.shield,
-        twin_words="quadrotor in MuJoCo", near=_NEAR,
-    )  # fmt: skip
-    console.print(f"Figure: {png} and {pdf}", soft_wrap=True)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sidestep.bridges.twin.robots import mjcf_colour
+from sidestep.bridges.twin.robots import mjcf_colour, studio
 from sidestep.world.flyers import GRAVITY
 
 ROTORS = ("front_left", "rear_left", "rear_right", "front_right")
@@ -134,18 +134,7 @@ def scene_xml(
     return f"""<mujoco model="sidestep flight">
   <option timestep="{physics_step}" integrator="implicitfast" gravity="0 0 {-GRAVITY}"/>
   <statistic extent="6" center="1 0 0.5"/>
-  <visual>
-    <global offwidth="1920" offheight="1200"/>
-    <quality shadowsize="4096" offsamples="4"/>
-    <map shadowclip="1.2" znear="0.005"/>
-    <headlight ambient="0.4 0.4 0.4" diffuse="0.2 0.2 0.2" specular="0 0 0"/>
-  </visual>
-  <asset>
-    <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" width="16" height="16"/>
-    <texture name="tiles" type="2d" builtin="flat" mark="edge" rgb1="0.9 0.9 0.89" markrgb="0.7 0.7 0.69"
-             width="128" height="128"/>
-    <material name="floor" texture="tiles" texrepeat="2 2" texuniform="true" reflectance="0" specular="0"/>
-  </asset>
+{studio(shadows=4096, view='shadowclip="1.2" znear="0.005"', tiles=2)}
   <default>
     <default class="shown"><geom contype="0" conaffinity="0" mass="0"/></default>
   </default>

@@ -13,14 +13,13 @@ from sidestep.bridges.flight.autopilot import Attitude, Autopilot, Setpoint
 from sidestep.bridges.flight.estimate import OwnMotion
 from sidestep.bridges.flight.options import FlightOptions, check_scenario
 from sidestep.bridges.twin import Contacts, Measurement, TwinError, Watch
-from sidestep.bridges.twin.library import load_mujoco
-from sidestep.bridges.twin.sensors import PoseSensor
+from sidestep.bridges.twin.library import check_robots, load_mujoco
+from sidestep.bridges.twin.sensors import PoseSensors
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER
 from sidestep.world import Scenario, World
 from sidestep.world.flyers import GRAVITY, Quadrotor
 from sidestep.world.robots import body_velocity
 
-_SEEN_BEFORE = 0.5
 _FRAME_RATE = 100.0
 _COLUMN = 0.6
 """Radius of a column, as a share of the collision distance; the quadrotor needs the rest."""
@@ -108,12 +107,8 @@ class Flight:
 
         **Raises** `TwinError` for a world with other numbers of robots than the scenario's.
         """
-        counts = (len(world.pursuers), len(world.obstacles))
-        if counts != self.counts:
-            raise TwinError(
-                f"the world has {counts[0]} pursuers and {counts[1]} obstacles, the scenario "
-                f"{self.counts[0]} and {self.counts[1]}"
-            )
+        counts = self.counts
+        check_robots(world, *counts)
         self._seed = self._seed if seed is None else seed
         options, data = self.options, self.data
         self._target, self._steps = np.asarray(world.target, float), 0
@@ -134,13 +129,8 @@ class Flight:
         self.tracking_error = 0.0
         self.saturated = 0.0
         root = np.random.default_rng(self._seed)
-        names = [("evader", 0), *(("pursuer", i) for i in range(counts[0]))]
-        names += [("obstacle", i) for i in range(counts[1])]
-        *generators, self._noise = root.spawn(len(names) + 1)
-        self._sensors = [
-            PoseSensor(options.sensors, robot, index, options.physics_step, generator)
-            for (robot, index), generator in zip(names, generators, strict=True)
-        ]
+        self._sensors = PoseSensors(options.sensors, counts, options.physics_step, root)
+        (self._noise,) = root.spawn(1)
         self._own = OwnMotion(
             options.acceleration_noise, options.sensors.position_noise, 1.0 / options.sensors.rate
         )
@@ -152,22 +142,14 @@ class Flight:
         self._level = self._level.reshape(3, 3)
         self._show()
         self._mujoco.mj_forward(self.model, data)
-        self._watch_the_start()
-
-    def _watch_the_start(self) -> None:
-        """The sensors have been on for a while when the clock starts: what they saw arrives at once."""
-        step, sensors = self.options.physics_step, self.options.sensors
-        before = math.ceil((_SEEN_BEFORE + sensors.delay + 1.0 / sensors.rate) / step)
-        ages = step * np.arange(-before, 1)
-        poses = np.repeat(self._poses()[None], before + 1, axis=0)
-        for index, aircraft in enumerate(self._aircraft, 1):
-            speed, heading = aircraft.motion[0], aircraft.pose[2]
-            poses[:, index, :2] += np.outer(ages, speed * np.array([math.cos(heading), math.sin(heading)]))
-        for index, column in enumerate(self._columns, 1 + len(self._aircraft)):
-            poses[:, index, :2] += np.outer(ages, column[2:])
-        for robot, sensor in enumerate(self._sensors):
-            sensor.watch(-before, poses[:, robot])
-        self._sensors[0].arrived(0.0)
+        ahead = [
+            craft.motion[0] * np.array([math.cos(craft.pose[2]), math.sin(craft.pose[2])])
+            for craft in self._aircraft
+        ]
+        moving = np.array([np.zeros(2), *ahead, *self._columns[:, 2:]])
+        self._sensors.watch_the_start(self._poses(), moving)
+        # Its own start is known.
+        self._sensors.evaders(0.0)
 
     @property
     def time(self) -> float:
@@ -233,8 +215,7 @@ class Flight:
             if self._steps % self._ticks == 0:
                 self._plan[:] = self._transition @ self._plan
             poses[index] = self._poses()
-            for robot, sensor in enumerate(self._sensors):
-                sensor.watch(self._steps, poses[index : index + 1, robot])
+            self._sensors.watch(self._steps, poses[index : index + 1])
         if not np.all(np.isfinite(poses)) or abs(data.qpos[2] - options.height) > 0.5 * options.height:
             raise TwinError(
                 f"the quadrotor lost its height at {self.time:.3f} s: its gains, or its rotors, do not do "
@@ -257,7 +238,7 @@ class Flight:
         felt = taken @ (rotation.T @ (felt + weight)) - weight
         if self._steps:
             self._own.feel(self.time, felt, period)
-        for seen in self._sensors[0].arrived(self.time):
+        for seen in self._sensors.evaders(self.time):
             # The height is measured by the same cameras.
             height = self.data.qpos[2] + self._noise.standard_normal() * self.options.sensors.position_noise
             self._own.see(seen.stamp, np.array([*seen.pose[:2], height]))
@@ -297,7 +278,7 @@ class Flight:
 
     def measurements(self) -> list[Measurement]:
         """Poses of the others that have arrived by now and were not handed out before, oldest first."""
-        return [one for sensor in self._sensors[1:] for one in sensor.arrived(self.time)]
+        return self._sensors.others(self.time)
 
     @property
     def world(self) -> World:

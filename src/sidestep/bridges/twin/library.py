@@ -17,6 +17,15 @@ class TwinError(ValueError):
     """The twin cannot run as asked; the message says what to install or to change."""
 
 
+def check_robots(world: Any, pursuers: int, obstacles: int) -> None:
+    """**Raises** `TwinError` for a world with other numbers of robots than the scenario's."""
+    if (len(world.pursuers), len(world.obstacles)) != (pursuers, obstacles):
+        raise TwinError(
+            f"the world has {len(world.pursuers)} pursuers and {len(world.obstacles)} obstacles, "
+            f"the scenario {pursuers} and {obstacles}"
+        )
+
+
 def load_mujoco() -> Any:
     """The module `mujoco`, set up to render without a screen where that is possible.
 

@@ -180,6 +180,25 @@ def obstacle_motors(index: int) -> str:
     )
 
 
+def studio(*, shadows: int, view: str, tiles: int) -> str:
+    """Light, sky and the material of a tiled floor as MJCF: `shadows` across in pixels, attributes of how it
+    is `view`ed, `tiles` to a metre."""
+    return f"""\
+  <visual>
+    <global offwidth="1920" offheight="1200"/>
+    <quality shadowsize="{shadows}" offsamples="4"/>
+    <map {view}/>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.2 0.2 0.2" specular="0 0 0"/>
+  </visual>
+  <asset>
+    <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" width="16" height="16"/>
+    <texture name="tiles" type="2d" builtin="flat" mark="edge" rgb1="0.9 0.9 0.89" markrgb="0.7 0.7 0.69"
+             width="128" height="128"/>
+    <material name="floor" texture="tiles" texrepeat="{tiles} {tiles}" texuniform="true" reflectance="0"
+              specular="0"/>
+  </asset>"""
+
+
 def scene_xml(
     base: str,
     half_axle: float,
@@ -208,18 +227,7 @@ def scene_xml(
     return f"""<mujoco model="sidestep twin">
   <option timestep="{physics_step}" integrator="implicitfast" cone="elliptic" impratio="10"/>
   <statistic extent="3" center="1 0 0"/>
-  <visual>
-    <global offwidth="1920" offheight="1200"/>
-    <quality shadowsize="2048" offsamples="4"/>
-    <map shadowclip="1.5"/>
-    <headlight ambient="0.4 0.4 0.4" diffuse="0.2 0.2 0.2" specular="0 0 0"/>
-  </visual>
-  <asset>
-    <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" width="16" height="16"/>
-    <texture name="tiles" type="2d" builtin="flat" mark="edge" rgb1="0.9 0.9 0.89" markrgb="0.7 0.7 0.69"
-             width="128" height="128"/>
-    <material name="floor" texture="tiles" texrepeat="4 4" texuniform="true" reflectance="0" specular="0"/>
-  </asset>
+{studio(shadows=2048, view='shadowclip="1.5"', tiles=4)}
   <default>
     <default class="shown"><geom contype="0" conaffinity="0" mass="0"/></default>
     <default class="rolling"><geom contype="0" conaffinity="1" condim="3" friction="0.9"/></default>

@@ -108,6 +108,7 @@ def changed_sensors(sensors: Sensors, changes: Mapping[str, Any]) -> Sensors:
     return dataclasses.replace(sensors, **changes)
 
 
+_SEEN_BEFORE = 0.5
 _KINDS = {True: "true or false", False: "a number"}
 
 
@@ -192,3 +193,50 @@ class PoseSensor:
         while self._under_way and self._under_way[0][0] <= now + 1e-9:
             handed_out.append(self._under_way.popleft()[1])
         return handed_out
+
+
+@final
+class PoseSensors:
+    """A sensor for every robot: the evader's first, then the pursuers', then the obstacles'.
+
+    Each has random numbers of its own, spawned from `root`, so that what one measures does not hang on
+    another. `counts` are those of pursuers and obstacles.
+    """
+
+    def __init__(self, sensors: Sensors, counts: tuple[int, int], step: float, root: np.random.Generator):
+        self._settings, self._step = sensors, step
+        names = [("evader", 0), *(("pursuer", i) for i in range(counts[0]))]
+        names += [("obstacle", i) for i in range(counts[1])]
+        self._each = [
+            PoseSensor(sensors, robot, index, step, generator)
+            for (robot, index), generator in zip(names, root.spawn(len(names)), strict=True)
+        ]
+
+    def watch_the_start(
+        self, poses: Float[np.ndarray, "robots 3"], velocities: Float[np.ndarray, "robots 2"]
+    ) -> None:
+        """They have been on for a while when the clock starts: what they saw arrives at once. Until then the
+        robots came to these poses straight on, at these velocities (m/s)."""
+        settings = self._settings
+        before = math.ceil((_SEEN_BEFORE + settings.delay + 1.0 / settings.rate) / self._step)
+        ages = self._step * np.arange(-before, 1)
+        seen = np.repeat(poses[None], before + 1, axis=0)
+        seen[:, :, :2] += ages[:, None, None] * velocities
+        self.watch(-before, seen)
+
+    def watch(self, first: int, poses: Float[np.ndarray, "n robots 3"]) -> None:
+        """`PoseSensor.watch` of every robot."""
+        for robot, sensor in enumerate(self._each):
+            sensor.watch(first, poses[:, robot])
+
+    def arrived(self, now: float) -> list[Measurement]:
+        """What has arrived by `now` (s) and was not handed out before; per robot, oldest first."""
+        return [one for sensor in self._each for one in sensor.arrived(now)]
+
+    def evaders(self, now: float) -> list[Measurement]:
+        """The same of the evader alone."""
+        return self._each[0].arrived(now)
+
+    def others(self, now: float) -> list[Measurement]:
+        """The same of all but the evader."""
+        return [one for sensor in self._each[1:] for one in sensor.arrived(now)]

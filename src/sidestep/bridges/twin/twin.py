@@ -10,14 +10,13 @@ from jaxtyping import Float
 
 from sidestep.bridges.twin.actuation import DelayLine, omniwheel_speeds, yaw_rate
 from sidestep.bridges.twin.contacts import Contacts, Watch
-from sidestep.bridges.twin.library import TwinError, load_mujoco
+from sidestep.bridges.twin.library import TwinError, check_robots, load_mujoco
 from sidestep.bridges.twin.options import TwinOptions
 from sidestep.bridges.twin.robots import WHEEL_RADIUS, scene_xml
-from sidestep.bridges.twin.sensors import Measurement, PoseSensor
+from sidestep.bridges.twin.sensors import Measurement, PoseSensors
 from sidestep.world import Scenario, World
 
 _SETTLE = 0.3
-_SEEN_BEFORE = 0.5
 _COLOURS = ("#0072B2", "#D55E00", "#595959")
 _FRAME_RATE = 100.0
 _LIMITS = ("evader_speed", "pursuer_speed")
@@ -101,12 +100,8 @@ class Twin:
         **Raises** `TwinError` for a world with other numbers of robots than the scenario's.
         """
         scenario, places, data = self.scenario, self._places, self.data
-        counts = (len(world.pursuers), len(world.obstacles))
-        if counts != (scenario.pursuer_count, scenario.obstacle_count):
-            raise TwinError(
-                f"the world has {counts[0]} pursuers and {counts[1]} obstacles, the scenario "
-                f"{scenario.pursuer_count} and {scenario.obstacle_count}"
-            )
+        counts = scenario.pursuer_count, scenario.obstacle_count
+        check_robots(world, *counts)
         self._seed = self._seed if seed is None else seed
         self._target = np.asarray(world.target, float)
         self._steps = 0
@@ -128,27 +123,14 @@ class Twin:
         self._commanded = np.zeros((counts[0], 2))
         self.frames: list[Float[np.ndarray, "nq"]] = []
         self.frame_times: list[float] = []
-        root = np.random.default_rng(self._seed)
-        names = [("evader", 0), *(("pursuer", i) for i in range(counts[0]))]
-        names += [("obstacle", i) for i in range(counts[1])]
-        self._sensors = [
-            PoseSensor(self.options.sensors, robot, index, self.options.physics_step, generator)
-            for (robot, index), generator in zip(names, root.spawn(len(names)), strict=True)
-        ]
         self._contacts = Watch(scenario, self._target)
-        self._watch_the_start()
-
-    def _watch_the_start(self) -> None:
-        """The sensors have been on for a while when the clock starts: what they saw arrives at once."""
-        step = self.options.physics_step
-        sensors = self.options.sensors
-        before = math.ceil((_SEEN_BEFORE + sensors.delay + 1.0 / sensors.rate) / step)
-        poses = np.repeat(self.poses_of(self.data.qpos[None]), before + 1, axis=0)
-        ages = step * np.arange(-before, 1)
-        for index, first in enumerate(self._places.obstacle_velocities):
-            robot = 1 + len(self._places.pursuers) + index
-            poses[:, robot, :2] += ages[:, None] * self.data.qvel[first : first + 2]
-        self._watch(-before, poses)
+        poses = self.poses_of(data.qpos[None])[0]
+        moving = np.zeros((len(poses), 2))
+        for robot, first in enumerate(places.obstacle_velocities, 1 + counts[0]):
+            moving[robot] = data.qvel[first : first + 2]
+        root, step = np.random.default_rng(self._seed), self.options.physics_step
+        self._sensors = PoseSensors(self.options.sensors, counts, step, root)
+        self._sensors.watch_the_start(poses, moving)
 
     def _place(self, world: World) -> None:
         """Set x, y and heading of everything; heights stay."""
@@ -209,7 +191,7 @@ class Twin:
         if not np.all(np.isfinite(trace)):
             raise TwinError(f"the physics became unstable at {self.time:.3f} s; use a smaller physics_step")
         poses = self.poses_of(trace)
-        self._watch(self._steps - count + 1, poses)
+        self._sensors.watch(self._steps - count + 1, poses)
         return self._contacts.see(poses)
 
     def _drive(self, velocity: Float[np.ndarray, "2"]) -> None:
@@ -236,13 +218,9 @@ class Twin:
             poses[:, robot, 2] = _heading(trace[:, start + 3 : start + 7])
         return poses
 
-    def _watch(self, first: int, poses: Float[np.ndarray, "n robots 3"]) -> None:
-        for robot, sensor in enumerate(self._sensors):
-            sensor.watch(first, poses[:, robot])
-
     def measurements(self) -> list[Measurement]:
         """What has arrived by now and was not handed out before; per robot, oldest first."""
-        arrived = [one for sensor in self._sensors for one in sensor.arrived(self.time)]
+        arrived = self._sensors.arrived(self.time)
         for one in arrived:
             if one.robot == "evader":
                 self._known_heading = one.pose[2]
