@@ -131,6 +131,13 @@ NEEDS = {
 BRIEFLY = ("--steps", "60", "--episodes", "1", "--shield", "none")
 
 
+def test_the_gallery_shows_every_example():
+    gallery = (ROOT / "docs" / "gallery.md").read_text()
+    for path in (ROOT / "examples").iterdir():
+        if path.suffix in (".py", ".toml"):
+            assert f'--8<-- "examples/{path.name}"' in gallery, path.name
+
+
 @pytest.mark.parametrize("example", sorted(path.name for path in (ROOT / "examples").glob("*.py")))
 def test_examples_run(example):
     module, package = NEEDS.get(example, ("sidestep", ""))
