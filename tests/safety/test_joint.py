@@ -322,3 +322,32 @@ def test_close_to_the_axis_the_wish_picks_the_side_and_farther_off_it_does_not()
         # At the tip of the capture set, or far to one side, only the evader's own side can be kept.
         assert pick(jnp.array([0.2542, 0.004]), right, side) == 1.0
         assert pick(jnp.array([0.27, 0.06]), right, side) == 1.0
+
+
+def test_who_has_used_up_what_is_kept_beyond_the_distance_does_not_change_to_a_side_that_is_lost():
+    """Close to the axis and outside the capture set by less than the margin, the falsifier found a
+    `joint` that followed the wish across and gave away a millimetre."""
+    scenario = load_scenario("paper")
+    angle, capture = float(scenario.usable_angle), float(scenario.capture_distance)
+    rng = np.random.default_rng(0)
+    spare = rng.uniform(0.02e-3, 0.38e-3, 100)
+    across = rng.uniform(0.3e-3, 0.98e-3, 100) * rng.choice([-1.0, 1.0], 100)
+    ahead = (capture + spare - np.abs(across) * np.sin(angle)) / np.cos(angle)
+    places = jnp.asarray(np.stack([ahead * rng.choice([-1.0, 1.0], 100), across], axis=1), float)
+    others = jnp.asarray(-np.sign(across), float)
+    for shield in (make_shield("game", scenario), make_shield("joint", scenario).rows_only):
+
+        def answer(place, other, shield=shield):
+            world = World(place, jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.zeros(2))
+            # It remembers the other side, and wishes to go there.
+            result, memory = shield(
+                world, scenario.evader_speed * jnp.stack([0.0 * other, other]), other[None]
+            )
+            moved, _ = scenario.step(world, result.action, jnp.sign(place[0]) * jnp.full((1, 2), 0.2))
+            after, _ = shield(moved, jnp.zeros(2), memory)
+            return result.barriers[0], memory[0], after.barriers[0]
+
+        values, sides, later = (np.asarray(part) for part in jax.jit(jax.vmap(answer))(places, others))
+        np.testing.assert_array_equal(sides, np.sign(across))
+        np.testing.assert_allclose(values, spare, atol=1e-6)
+        assert np.min(later - values) > -1e-6

@@ -380,8 +380,10 @@ class PursuitBarrier(Barrier):
         h = ahead * cosine - across * sine - game.capture_distance
         own = ahead * cosine + across * sine - game.capture_distance
         feasible = (h >= 0.0) & (across <= KEEP_SIDE * self._reach(scenario, game, h))
-        # With no side left to save it, the evader still does best to commit to one.
-        lost = (own < 0.0) | (self._reach(scenario, game, own) < 0.0)
+        # With no side left to save it, the evader still does best to commit to one. One that has only used up
+        # what is kept beyond the distance itself is not lost: its own side saves it, the other may not.
+        spare = self.eased if self.budget is None else 0.0
+        lost = (own + spare < 0.0) | (self._reach(scenario, game, own) < 0.0)
         return in_front & (feasible | (lost & (across <= LOST_SIDE * game.capture_distance)))
 
     def _surely_feasible(
