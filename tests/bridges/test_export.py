@@ -78,6 +78,15 @@ def worlds(scenario, count, seed):
     state["pursuers"][50:80, 0, :2] = state["evader"][50:80]
     state["obstacles"][80:110, 0, :2] = state["evader"][80:110]
     state["target"][110:140] = state["evader"][110:140]
+    # Next to the tips of the capture set, in what the rows keep beyond it and inside it.
+    spare = 1e-3 * np.where(
+        rng.random(200) < 0.5, rng.uniform(0.02, 0.36, 200), rng.uniform(-0.5, -0.02, 200)
+    )
+    across = rng.uniform(-1.1e-3, 1.1e-3, 200)
+    tip = float(scenario.capture_distance) + spare - np.abs(across) * np.sin(float(scenario.usable_angle))
+    ahead = rng.choice([-1, 1], 200) * tip / np.cos(float(scenario.usable_angle))
+    state["evader"][140:340] = 0.0
+    state["pursuers"][140:340, 0] = np.stack([-ahead, -across, 0.0 * across], -1)
     return state
 
 

@@ -23,7 +23,10 @@ _SMALLEST = 1e-30
 
 @dataclass(frozen=True)
 class Constants:
-    """The numbers in the rows: distances and sizes in m, slopes in 1/s, speeds in units of the evader's."""
+    """The numbers in the rows: distances and sizes in m, slopes in 1/s, speeds in units of the evader's.
+
+    `unlost` is how much of the distance kept an evader may have used up without counting as lost.
+    """
 
     speed: float
     pursuer_speed: float
@@ -37,6 +40,7 @@ class Constants:
     steep: float
     spare: float
     eased: float
+    unlost: float
     obstacle_gain: float
     tracking_error: float
     position_doubt: float = 0.0
@@ -87,6 +91,7 @@ def _constants(shield: GameShield) -> Constants:
         steep=max(gain, STEEPER * turning) / speed,
         spare=max(float(game.largest_capture_distance - game.capture_distance), 0.0),
         eased=float(sampling_margin(scenario)),
+        unlost=float(sampling_margin(scenario)) if budget is None else 0.0,
         obstacle_gain=float(scenario.obstacle_gain) / speed,
         tracking_error=0.0 if budget is None else float(budget.tracking_error) / speed,
     )
@@ -280,7 +285,7 @@ def _layers(constants: Constants) -> tuple[np.ndarray, np.ndarray]:
         hidden[front_up] - hidden[front_down],
         heights[0],
         KEEP_SIDE * reaches[0] - hidden[across],
-        -heights[1],
+        -heights[1] - constants.unlost * bias,
         -reaches[1],
         LOST_SIDE * constants.capture * bias - hidden[across],
     ]
