@@ -3,22 +3,21 @@
 from sidestep.safety.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.barrier_shield import BarrierShield, shield_of
 from sidestep.safety.barriers import (
-    BARRIERS,
     Barrier,
     BarrierRows,
     ObstacleBarrier,
-    PursuitBarrier,
     RangeBarrier,
     compose,
 )
 from sidestep.safety.budget import Budget, BudgetWarning
-from sidestep.safety.catalogue import SHIELDS, as_shield, make_shield
+from sidestep.safety.catalogue import BARRIERS, SHIELDS, as_shield, make_shield
 from sidestep.safety.certificate import Certificate, certify
 from sidestep.safety.distance_game import DistanceValue, grid_barrier, solve_distance
 from sidestep.safety.filter import Projection, project, tolerance
 from sidestep.safety.frame_barrier import FrameBarrier
 from sidestep.safety.joint import JointShield
 from sidestep.safety.probe import BarrierProbe, BarrierWarning, probe_barrier
+from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.shields import (
     GameShield,
     NoShield,

@@ -1,12 +1,13 @@
-"""Every shield by name."""
+"""Every shield and every barrier by name."""
 
 import dataclasses
 
 from sidestep.safety.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.barrier_shield import shield_of
-from sidestep.safety.barriers import Barrier
+from sidestep.safety.barriers import Barrier, ObstacleBarrier, RangeBarrier
 from sidestep.safety.budget import Budget
 from sidestep.safety.joint import JointShield
+from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.shields import GameShield, NoShield, PaperShield, Shield
 from sidestep.world.scenario import Scenario
 
@@ -17,6 +18,13 @@ SHIELDS: dict[str, type[Shield]] = {
     "joint": JointShield,
 }
 """Every shield by name."""
+BARRIERS: dict[str, Barrier] = {
+    "obstacle": ObstacleBarrier(),
+    "range": RangeBarrier(),
+    "pursuit": PursuitBarrier(),
+    "pursuit, velocity known": PursuitBarrier(known_velocity=True),
+}
+"""Every barrier by name."""
 _BUDGETED: dict[str, type[GameShield] | type[JointShield]] = {"game": GameShield, "joint": JointShield}
 
 

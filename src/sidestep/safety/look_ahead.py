@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sidestep._arrays import Count, Lanes, Scalar, length, stack
 from sidestep.pursuit import Pursuer, pursue
-from sidestep.safety.barriers import PursuitBarrier
+from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 

@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sidestep._arrays import Scalar
-from sidestep.safety.barriers import PursuitBarrier
 from sidestep.safety.flow_map import seen_from, side_value, turn_drive_turn
+from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.sampling_margin import guarded, sampling_margin
 from sidestep.world.scenario import Scenario
 

@@ -14,13 +14,13 @@ from sidestep.safety.barriers import (
     Barrier,
     BarrierRows,
     ObstacleBarrier,
-    PursuitBarrier,
     RangeBarrier,
     compose,
 )
 from sidestep.safety.budget import Budget
 from sidestep.safety.filter import project, project_known
 from sidestep.safety.least_violation import root
+from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.sampling_margin import guarded, margins, sampling_margin
 from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario

@@ -15,7 +15,7 @@ from sidestep.bridges.export.levels_graph import Row
 from sidestep.bridges.export.scene import Scene, for_each, picks
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import GameShield
-from sidestep.safety.barriers import KEEP_SIDE, LOST_SIDE, STEEPER
+from sidestep.safety.pursuit_barrier import KEEP_SIDE, LOST_SIDE, STEEPER
 from sidestep.safety.sampling_margin import guarded, sampling_margin
 
 _SMALLEST = 1e-30
