@@ -136,7 +136,11 @@ def test_interrupt_stops_cleanly_and_the_run_goes_on_from_there(run, tmp_path):
         while child.poll() is None and not (out / "metrics.jsonl").exists():
             time.sleep(0.005)
         child.send_signal(signal.SIGINT)
-        shown = child.communicate()[0]
+        try:
+            shown = child.communicate(timeout=120.0)[0]
+        except subprocess.TimeoutExpired:
+            child.kill()
+            raise
     assert child.returncode == 130, shown
     assert "Traceback" not in shown
     assert "--resume" in shown

@@ -1,6 +1,7 @@
 """Hazard: a policy or a curve read back that is not the one that was written."""
 
 import struct
+import threading
 from types import SimpleNamespace
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 from sidestep._arrays import real
 from sidestep.learning import load_policy
 from sidestep.learning.checkpoints import CheckpointError
+from sidestep.learning.curves import Curves
 from sidestep.learning.networks import Actor
 from sidestep.learning.policy import LearnedPolicy, write_policy
 from sidestep.learning.records import RunError, create_run, read_metrics
@@ -85,6 +87,32 @@ def read_events(folder):
     return scalars
 
 
+def test_curves_interrupted_anywhere_hold_whole_chunks_and_leave_nothing_to_wait_for(tmp_path, monkeypatch):
+    """A writer with a thread of its own, interrupted while it handed an event over, never ended."""
+    from tensorboardX import summary
+
+    losses = SimpleNamespace(critic=np.ones(2), actor=np.ones(2), value=np.ones(2))
+    line = {"episode": 1, "outcome": "reached", "return": 5.0, "steps": 7}
+    threads, scalar, left = threading.active_count(), summary.scalar, [4]
+
+    def interrupted(*arguments):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return scalar(*arguments)
+
+    curves = Curves(tmp_path, 1)
+    monkeypatch.setattr(summary, "scalar", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        curves.write([line], losses)
+    assert read_events(tmp_path / "curves") == {}
+    left[0] = 100
+    curves.write([line], losses)
+    names = "episode/return", "episode/steps", "episode/reached", "loss/critic", "loss/actor", "loss/value"
+    assert set(read_events(tmp_path / "curves")) == {(1, name) for name in names}
+    assert threading.active_count() == threads
+
+
 @pytest.mark.slow
 def test_curves_hold_each_episode_once_even_after_a_resume(small, tmp_path, monkeypatch):
     calls = []
@@ -95,7 +123,7 @@ def test_curves_hold_each_episode_once_even_after_a_resume(small, tmp_path, monk
             raise KeyboardInterrupt
 
     # A clock that stands still: event files are named by the second, and a fast resume must not clash.
-    monkeypatch.setattr("tensorboardX.event_file_writer.time", SimpleNamespace(time=lambda: 1.7e9))
+    monkeypatch.setattr("sidestep.learning.curves.time", SimpleNamespace(time=lambda: 1.7e9))
     small.train(out=tmp_path / "run", progress=interrupt)
     small.train(out=tmp_path / "run", resume=True)
     scalars = read_events(tmp_path / "run" / "curves")

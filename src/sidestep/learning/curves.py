@@ -2,38 +2,74 @@
 
 from __future__ import annotations
 
+import socket
+import struct
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sidestep.learning.training import Report
+
+def _protos() -> Any:
+    # Imported where it is needed: by trainings only, and it takes a while.
+    from tensorboardX.proto import event_pb2
+
+    return event_pb2
 
 
 class Curves:
-    """Scalars over episodes: return, steps, clearances, interventions, losses."""
+    """Scalars over episodes: return, steps, clearances, interventions, losses.
+
+    Written here, one chunk at a time, and not by tensorboardX's `SummaryWriter`: an interrupt while that one
+    hands an event to its thread can leave its `close` waiting for ever.
+    """
 
     def __init__(self, folder: str | Path, purge_step: int):
-        # Imported here because it is needed by trainings only and takes a while.
-        from tensorboardX import SummaryWriter
-
+        event = _protos()
         place = Path(folder) / "curves"
+        place.mkdir(parents=True, exist_ok=True)
         # Files are named by the second; the count keeps a resume within it from overwriting what is there.
         count = len(list(place.glob("events.out.tfevents.*")))
-        self._writer = SummaryWriter(str(place), purge_step=purge_step, filename_suffix=f".{count:06d}")
+        self._path = place / f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{count:06d}"
+        start = event.SessionLog(status=event.SessionLog.START)
+        self._append(
+            [
+                event.Event(file_version="brain.Event:2"),
+                event.Event(step=purge_step, file_version="brain.Event:2"),
+                event.Event(step=purge_step, session_log=start),
+            ]
+        )
 
-    def write(self, lines: list[dict[str, Any]], report: Report) -> None:
-        """Add the episodes of a chunk, and the mean losses of the chunk at its last episode."""
+    def write(self, lines: list[dict[str, Any]], losses: Any) -> None:
+        """Add the episodes of a chunk, and the means of its `losses` (critic, actor, value) at its last
+        episode."""
+        from tensorboardX.summary import scalar
+
+        entries: list[tuple[str, float, int]] = []
         for line in lines:
             for name, value in line.items():
                 if name not in ("episode", "outcome") and value is not None:
-                    self._writer.add_scalar(f"episode/{name}", value, line["episode"])
-            self._writer.add_scalar("episode/reached", float(line["outcome"] == "reached"), line["episode"])
+                    entries.append((f"episode/{name}", value, line["episode"]))
+            entries.append(("episode/reached", float(line["outcome"] == "reached"), line["episode"]))
         if lines:
             for name in ("critic", "actor", "value"):
-                self._writer.add_scalar(
-                    f"loss/{name}", float(np.mean(getattr(report.losses, name))), lines[-1]["episode"]
-                )
+                mean = float(np.mean(getattr(losses, name)))
+                entries.append((f"loss/{name}", mean, lines[-1]["episode"]))
+        make = _protos().Event
+        self._append([make(step=step, summary=scalar(name, value)) for name, value, step in entries])
 
-    def close(self) -> None:
-        self._writer.close()
+    def _append(self, events: list[Any]) -> None:
+        """As TFRecords: length, its checksum, the event, its checksum."""
+        from tensorboardX.record_writer import masked_crc32c
+
+        now, records = time.time(), []
+        for event in events:
+            event.wall_time = now
+            data = event.SerializeToString()
+            length = struct.pack("<Q", len(data))
+            for part in (length, data):
+                records += [part, struct.pack("<I", masked_crc32c(part))]
+        # Unbuffered and at once: a chunk is in the file or not, whatever interrupts.
+        with open(self._path, "ab", buffering=0) as file:
+            file.write(b"".join(records))

@@ -187,7 +187,7 @@ def train(
             chunk_seconds.append((int(state.env_steps) - steps_before, now - chunk_begun))
             if folder is not None and curves is not None:
                 records.append_metrics(folder, lines)
-                curves.write(lines, report)
+                curves.write(lines, report.losses)
                 if now - saved >= checkpoint_seconds:
                     write_checkpoint(folder, state, wall_seconds=earlier + now - begun)
                     saved = now
@@ -200,8 +200,6 @@ def train(
         interrupted = True
     finally:
         figures = summary()
-        if curves is not None:
-            curves.close()
         if folder is not None:
             records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
             write_checkpoint(folder, state, wall_seconds=earlier + time.perf_counter() - begun)
