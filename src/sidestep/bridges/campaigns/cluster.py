@@ -62,10 +62,10 @@ def connected(scheduler: Any, workers: int | None, threads: int | None) -> Itera
 
     Local workers and their scheduler listen on 127.0.0.1 only, without a dashboard, and end with the command.
 
-    **Raises** `ValueError` when nothing answers at the address, or for options that do not go together.
+    The options are those that `check_options` lets through. **Raises** `ValueError` when nothing answers at
+    the address.
     """
     distributed: Any = needed("distributed", "cluster", "campaigns need")
-    check_options(scheduler, workers, threads)
     if scheduler == LOCAL:
         with _local(distributed, *local_size(workers, threads)) as client:
             yield client
