@@ -25,7 +25,8 @@ BARRIERS: dict[str, Barrier] = {
     "pursuit, velocity known": PursuitBarrier(known_velocity=True),
 }
 """Every barrier by name."""
-_BUDGETED: dict[str, type[GameShield] | type[JointShield]] = {"game": GameShield, "joint": JointShield}
+BUDGETED: dict[str, type[GameShield] | type[JointShield]] = {"game": GameShield, "joint": JointShield}
+"""Shields that keep a budget."""
 
 
 def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> Shield:
@@ -41,14 +42,14 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     if not scenario.built_in:
         guarded = of_control_point(scenario)
         # The others say nothing of what a pursuer can do.
-        guarded = covered(guarded) if name in _BUDGETED else dataclasses.replace(guarded, pursuer_model=None)
+        guarded = covered(guarded) if name in BUDGETED else dataclasses.replace(guarded, pursuer_model=None)
         return AdaptedShield(scenario, make_shield(name, guarded, budget))
     if budget is None:
         return SHIELDS[name](scenario)
-    if name not in _BUDGETED:
+    if name not in BUDGETED:
         raise ValueError(f"the shield {name!r} keeps no budget; use 'game' or 'joint'")
     budget.announce(scenario)
-    return _BUDGETED[name](scenario, budget=budget)
+    return BUDGETED[name](scenario, budget=budget)
 
 
 def as_shield(shield: str | Shield | Barrier, scenario: Scenario) -> Shield:

@@ -28,12 +28,11 @@ from sidestep.learning.control_step import decide, decision_steps_of
 from sidestep.learning.records import OUTCOMES
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import AdaptedShield, Certificate, Shield, as_shield, certify, make_shield
+from sidestep.safety.catalogue import BUDGETED
 from sidestep.safety.certificate import start_margin
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
-
-_BUDGETED = ("game", "joint")
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ class Pilot:
         self.scenario, self.options = scenario, options or FlightOptions()
         check_scenario(scenario, self.options)
         if isinstance(shield, str):
-            budget = budget_of(self.options) if shield in _BUDGETED else None
+            budget = budget_of(self.options) if shield in BUDGETED else None
             shield = make_shield(shield, scenario, budget)
         adapted = as_shield(shield, scenario)
         if not isinstance(adapted, AdaptedShield):

@@ -25,11 +25,11 @@ from sidestep.bridges.onboard.tracks import EvaderTrack, ObstacleTrack, PursuerT
 from sidestep.learning import load_policy
 from sidestep.learning.control_step import decision_steps_of
 from sidestep.safety import JointShield, Shield, Status, make_shield
+from sidestep.safety.catalogue import BUDGETED
 from sidestep.safety.way_out import way_out
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario, World
 
-_BUDGETED = ("game", "joint")
 _CALM = 20
 """On-time decisions after which a core that fell behind looks ahead again."""
 
@@ -71,7 +71,7 @@ class Onboard:
         settings = self.settings
         self.settings.budget.check(scenario)
         if isinstance(shield, str):
-            budget = settings.budget if shield in _BUDGETED else None
+            budget = settings.budget if shield in BUDGETED else None
             shield = make_shield(shield, scenario, budget)
         self._shield = shield
         self._init = eqx.filter_jit(shield.init)
