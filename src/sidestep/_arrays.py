@@ -80,6 +80,13 @@ def _inside(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
 
 
+def whole_number(name: str, value: Any) -> int:
+    """`value` as an int. **Raises** `ValueError` that calls it `name` if it is not a whole number above 0."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} = {value!r}: it must be a whole number of at least 1")
+    return int(value)
+
+
 def real(value: object) -> Float[Array, "..."]:
     """`value` as a JAX array of the default float type (float32, or float64 under `jax_enable_x64`).
 

@@ -26,6 +26,7 @@ from sidestep.bridges.gym import (
     ShieldVectorWrapper,
     ShieldWrapper,
 )
+from sidestep.bridges.gym import vector as vector_module
 from sidestep.bridges.gym.calls import seed_words
 from sidestep.bridges.gym.wrappers import checked_shield
 from sidestep.safety import Status, make_shield
@@ -149,6 +150,41 @@ def test_worlds_side_by_side_live_through_what_each_does_alone(mode):
                 np.testing.assert_allclose(observations[lane], alone[lane].reset()[0], atol=1e-5)
     # Further than the starts that were drawn ahead.
     assert ends.min() > 3
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_the_number_of_threads_changes_nothing(mode, monkeypatch):
+    monkeypatch.setattr(vector_module, "useful_threads", lambda most: most)
+    make = lambda threads: PursuedVectorEnv(  # noqa: E731
+        12, autoreset_mode=mode, threads=threads, **TASK
+    )
+    alone, shared = make(1), make(3)
+    assert [part.size for part in shared._parts] == [4, 4, 4]
+    # Parts of one size, or else each would compile its own program.
+    assert len(make(5)._parts) == 4
+    random, over = np.random.default_rng(0), np.zeros(12, bool)
+
+    def same(one, other):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), one, other)
+
+    alone.reset(seed=1)
+    given = {"world": jax.tree.map(lambda leaf: leaf[::-1], alone.worlds)}
+    for options in (None, given):
+        same(alone.reset(seed=4, options=options)[0], shared.reset(seed=4, options=options)[0])
+        for _ in range(40):
+            if mode is AutoresetMode.DISABLED and np.any(over):
+                mask = {"reset_mask": over}
+                same(alone.reset(options=mask)[0], shared.reset(options=mask)[0])
+            actions = np.clip(AHEAD + 0.2 * random.normal(size=(12, 2)), -1.0, 1.0).astype(np.float32)
+            expected, made = alone.step(actions), shared.step(actions)
+            same(expected[:4], made[:4])
+            assert expected[4].keys() == made[4].keys()
+            same({n: v for n, v in expected[4].items() if n != "final_obs"},
+                 {n: v for n, v in made[4].items() if n != "final_obs"})  # fmt: skip
+            over = expected[2] | expected[3]
+        same(alone.worlds, shared.worlds)
+        over = np.zeros(12, bool)
+    shared.close()
 
 
 def test_resetting_all_worlds_begins_next_episodes_and_a_seed_begins_anew():

@@ -2,6 +2,7 @@
 others that misbehaves."""
 
 import json
+import threading
 
 import equinox as eqx
 import jax
@@ -9,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sidestep._arrays import whole_number
 from sidestep.learning.records import OUTCOMES
-from sidestep.trials import Evaluation, episode_key, evaluate, rollout
-from sidestep.trials import monte_carlo as module
+from sidestep.trials import Evaluation, crew, episode_key, evaluate, monte_carlo, rollout
 from sidestep.world import goal_seeking, load_scenario
 
 # Crowded and short, so that every outcome occurs.
@@ -61,11 +62,43 @@ def test_more_episodes_do_not_change_the_first_ones(evaluation, scenario):
     assert np.array_equal(fewer.returns, evaluation.returns[:40])
 
 
+def test_results_do_not_depend_on_the_number_of_threads(scenario, monkeypatch):
+    monkeypatch.setattr(monte_carlo, "useful_threads", lambda most: min(3, most))
+    run = lambda **more: evaluate(  # noqa: E731
+        scenario, "goal-seeking", "paper", "random", 101, 7, mapped=True, **more
+    )
+    compiled = crew._advance._cached._cache_size()  # pyright: ignore
+    shared, alone = run(batch=96), run(batch=32, threads=1)
+    # All threads, and the one alone, have the same width.
+    assert crew._advance._cached._cache_size() == compiled + 1  # pyright: ignore
+    for name in ("outcome", "returns", "steps", "min_pursuer_clearance", "interventions", "max_correction"):
+        assert np.array_equal(getattr(shared, name), getattr(alone, name)), name
+    assert shared.map is not None
+    assert alone.map is not None
+    for name, values in shared.map.to_arrays().items():
+        np.testing.assert_allclose(values, alone.map.to_arrays()[name], rtol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("host", ["policy", "pursuer"])
+def test_code_on_the_host_is_asked_by_one_thread(host, monkeypatch):
+    most = []
+    monkeypatch.setattr(monte_carlo, "useful_threads", lambda count: most.append(count) or count)
+
+    def answer(*_):
+        return np.array([0.1, 0.1])
+
+    policy = answer if host == "policy" else "goal-seeking"
+    pursuer = answer if host == "pursuer" else "turn-then-drive"
+    short = load_scenario("paper", **{**SETTING, "episode_steps": 5})
+    assert evaluate(short, policy, "none", pursuer, 100, 7, batch=96).episodes == 100
+    assert most == [1]
+
+
 def test_another_scenario_value_does_not_compile_again(evaluation, scenario):
-    before = module._advance._cached._cache_size()  # pyright: ignore
+    before = crew._advance._cached._cache_size()  # pyright: ignore
     faster = load_scenario("paper", **{**SETTING, "arena_side": 2.5, "pursuer_speed": 0.3})
     result = evaluate(faster, "goal-seeking", "none", "turn-then-drive", 33, 8, batch=32)
-    assert module._advance._cached._cache_size() == before  # pyright: ignore
+    assert crew._advance._cached._cache_size() == before  # pyright: ignore
     assert result.episodes == 33
 
 
@@ -144,7 +177,7 @@ def test_pursuer_that_cheats_is_kept_to_its_wheel_limits(scenario):
 @pytest.mark.parametrize("bad", [0, -1, 2.5, True, "many"])
 def test_a_number_of_episodes_that_makes_no_sense_is_refused(scenario, bad):
     with pytest.raises(ValueError, match="episodes"):
-        module._positive("episodes", bad)
+        whole_number("episodes", bad)
 
 
 def test_unknown_names_are_named(scenario):
@@ -180,3 +213,21 @@ def test_progress_never_goes_back_and_ends_at_all(scenario):
     run(lambda *count: seen.append(count))
     assert seen == sorted(seen)
     assert seen[-1] == (40, 40)
+
+
+def test_an_error_in_the_progress_display_ends_all_threads(scenario, monkeypatch):
+    monkeypatch.setattr(monte_carlo, "useful_threads", lambda most: min(3, most))
+
+    def broken(finished, episodes):
+        raise RuntimeError("the display is broken")
+
+    before = threading.active_count()
+    with pytest.raises(RuntimeError, match="display is broken"):
+        evaluate(scenario, "goal-seeking", "none", "turn-then-drive", 90, 0, batch=96, progress=broken)
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize("bad", [0, -1, True])
+def test_a_number_of_threads_that_makes_no_sense_is_refused(scenario, bad):
+    with pytest.raises(ValueError, match="threads"):
+        evaluate(scenario, "goal-seeking", "none", "turn-then-drive", 4, 0, threads=bad)

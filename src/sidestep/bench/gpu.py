@@ -62,13 +62,8 @@ def _worlds(settings: dict[str, Any]) -> tuple[Any, int, str]:
 
     scenario, size, periods = load_scenario("paper"), settings["size"], settings["periods"]
     starts = drawn(scenario, size)
-    advance, state = stepper(scenario, settings["shield"], "turn-then-drive", starts, periods)
-
-    def call(_: int) -> None:
-        nonlocal state
-        state = advance(state)
-
-    return call, size * periods, "decisions/s" if settings["shield"] == "joint" else "steps/s"
+    advance = stepper(scenario, settings["shield"], "turn-then-drive", starts, periods)
+    return lambda _: advance(), size * periods, "decisions/s" if settings["shield"] == "joint" else "steps/s"
 
 
 def _filter(settings: dict[str, Any]) -> tuple[Any, int, str]:

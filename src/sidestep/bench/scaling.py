@@ -115,16 +115,13 @@ def _pursuers(settings: dict[str, Any]) -> Points:
 
 
 def _stepped(scenario: Any, starts: Any, settings: dict[str, Any]) -> tuple[float, float, str]:
+    from sidestep._threads import useful_threads
     from sidestep.bench.worlds import stepper
 
     periods = 10
-    advance, state = stepper(scenario, settings["shield"], "turn-then-drive", starts, periods)
-
-    def call(_: int) -> None:
-        nonlocal state
-        state = advance(state)
-
-    spent, compiling = _measure(call, settings["seconds"])
+    threads = useful_threads(starts.evader.shape[0])
+    advance = stepper(scenario, settings["shield"], "turn-then-drive", starts, periods, threads=threads)
+    spent, compiling = _measure(lambda _: advance(), settings["seconds"])
     return spent / periods, compiling, "one control period of all worlds"
 
 

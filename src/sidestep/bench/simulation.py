@@ -1,6 +1,7 @@
 """Worlds with a pursuer, stepped: ours many at once, and the peer's one by one in a Gymnasium loop.
 
-Both live through the scenario `paper` with the pursuer `turn-then-drive` and head straight for the target.
+Ours are shared among as many threads as there are cores; the loop has one. Both live through the scenario
+`paper` with the pursuer `turn-then-drive` and head straight for the target.
 Ours is timed behind the shield `game` as well as without one; the Gymnasium environment has none.
 """
 
@@ -31,19 +32,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Control periods of worlds per second."""
     if settings["shield"] is None:
         return _loop(settings["seconds"])
+    from sidestep._threads import useful_threads
     from sidestep.bench.worlds import drawn, stepper
     from sidestep.world import load_scenario
 
     worlds, periods = settings["worlds"], settings["periods"]
     scenario = load_scenario("paper")
-    advance, state = stepper(scenario, settings["shield"], PURSUER, drawn(scenario, worlds), periods)
-    state, compiling = first_call(lambda: advance(state))
-
-    def step(_: int) -> None:
-        nonlocal state
-        state = advance(state)
-
-    seconds = durations(step, settings["seconds"])
+    starts, threads = drawn(scenario, worlds), useful_threads(worlds)
+    advance = stepper(scenario, settings["shield"], PURSUER, starts, periods, threads=threads)
+    _, compiling = first_call(advance)
+    seconds = durations(lambda _: advance(), settings["seconds"])
     per_period = [spent / periods for spent in seconds]
     return {
         "latency": spread(per_period, "ms"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -17,19 +18,24 @@ from sidestep.world import Scenario, World, load_scenario, to_velocity
 
 AHEAD = (1.0, 0.0)
 """The action of every side's policy: straight at the target."""
+_BLOCK = 1024
 
 
 def stepper(
-    scenario: Scenario, shield: str, pursuer: str, starts: World, periods: int
-) -> tuple[Callable[..., Any], Any]:
-    """`(advance(state) -> state, state)`: all worlds by `periods` control periods in one compiled call.
+    scenario: Scenario, shield: str, pursuer: str, starts: World, periods: int, *, threads: int = 1
+) -> Callable[[], None]:
+    """`advance()`: all worlds by `periods` control periods, in compiled calls.
 
     `starts` holds the worlds in front (leading axis), as `drawn` gives them. Each decides in every period,
     and starts again where it began as soon as its episode has ended; so every period of every
-    world is one that is lived through.
+    world is one that is lived through. With several threads they take turns at blocks of worlds small enough
+    for a core's cache; the number of worlds is then a multiple of their size, or smaller.
     """
     guard, chase = make_shield(shield, scenario), make_pursuer(pursuer)
-    keys = jax.random.split(jax.random.key(1), starts.evader.shape[0])
+    count = starts.evader.shape[0]
+    keys = jax.random.split(jax.random.key(1), count)
+    size = count if threads == 1 else min(_BLOCK, max(1, count // threads))
+    cuts = [slice(first, first + size) for first in range(0, count, size)]
 
     def period(start: World, at_start: Any, world: World, memory: Any, key: Any) -> tuple[World, Any]:
         ahead = jnp.broadcast_to(jnp.asarray(AHEAD, world.evader.dtype)[:, None], world.evader.shape)
@@ -39,17 +45,37 @@ def stepper(
         again = lambda fresh, old: jnp.where(ended, fresh, old)  # noqa: E731
         return jax.tree.map(again, start, moved), jax.tree.map(again, at_start, after)
 
-    starts = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
-    memories = eqx.filter_jit(start_in_lanes)(guard, starts)
-
     @jax.jit
-    def advance(starts: World, at_start: Any, state: tuple[World, Any], keys: Any) -> tuple[World, Any]:
+    def program(starts: World, at_start: Any, state: tuple[World, Any], keys: Any) -> tuple[World, Any]:
         def body(state: tuple[World, Any], _: None) -> tuple[tuple[World, Any], None]:
             return period(starts, at_start, *state, keys), None
 
         return jax.lax.scan(body, state, None, length=periods)[0]
 
-    return lambda state: jax.block_until_ready(advance(starts, memories, state, keys)), (starts, memories)
+    starts = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
+    blocks = [jax.tree.map(lambda leaf: leaf[..., cut], starts) for cut in cuts]  # noqa: B023
+    memories = [eqx.filter_jit(start_in_lanes)(guard, block) for block in blocks]
+    states = list(zip(blocks, memories, strict=True))
+    keys = [keys[cut] for cut in cuts]
+
+    def go_on(block: int) -> None:
+        moved = program(blocks[block], memories[block], states[block], keys[block])
+        states[block] = jax.block_until_ready(moved)
+
+    pool, compiled = ThreadPoolExecutor(threads), False
+
+    def advance() -> None:
+        nonlocal compiled
+        if len(blocks) == 1 or not compiled:
+            # Else each thread would compile it.
+            for block in range(len(blocks)):
+                go_on(block)
+            compiled = True
+            return
+        for _ in pool.map(go_on, range(len(blocks))):
+            pass
+
+    return advance
 
 
 def drawn(scenario: Scenario, count: int, seed: int = 0) -> World:

@@ -47,6 +47,21 @@ class CallablePursuer(Pursuer):
         return _on_host(strategy, scenario, world, key)
 
 
+def runs_on_host(pursuer: Pursuer, scenario: Scenario) -> bool:
+    """Whether this is a callable that needs concrete numbers, and so is asked on the host."""
+    if not isinstance(pursuer, CallablePursuer):
+        return False
+    strategy, traceable = eqx.combine(pursuer._arrays, pursuer._rest), False
+
+    def start(key: PRNGKeyArray) -> None:
+        nonlocal traceable
+        traceable = _is_traceable(strategy, scenario, scenario.reset(key), key)
+
+    # Only what shapes it would have.
+    jax.eval_shape(start, jax.random.key(0))
+    return not traceable
+
+
 def _is_traceable(strategy: Callable[..., Any], scenario: Scenario, world: World, key: PRNGKeyArray) -> bool:
     """Whether JAX can trace the callable; tried even outside `jit`, so that it behaves the same there.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, final
 
 import gymnasium
@@ -11,50 +13,22 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Float
 
-from sidestep.bridges.gym import fleet as fleets
-from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked
-from sidestep.bridges.gym.fleet import AHEAD, Fleet, Spares
+from sidestep._arrays import whole_number
+from sidestep._threads import useful_threads
+from sidestep.bridges.gym.calls import seed_words, unpacked
+from sidestep.bridges.gym.fleet import AHEAD
+from sidestep.bridges.gym.part import Part
 from sidestep.bridges.gym.rendering import Picture, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
-from sidestep.bridges.gym.task import Task, make_task
+from sidestep.bridges.gym.task import make_task
 from sidestep.bridges.gym.worlds import checked_options, given_world
+from sidestep.pursuit.foreign import runs_on_host
 from sidestep.world import World
 
-_DRAWN_AT_ONCE = 256
-
-
-def _launch(task: Task, words: Any, number: Any) -> tuple[list[Any], list[Any], Any]:
-    fleet = fleets.launch(task, words, number)
-    return _leaves(fleet), bundled(fleets.no_spares(fleet)), fleets.seen(task, fleet.episode)
-
-
-def _place(task: Task, fleet: Fleet, world: World) -> tuple[list[Any], Any]:
-    fleet = fleets.place(task, fleet, world)
-    return _leaves(fleet), fleets.seen(task, fleet.episode)
-
-
-def _follow(task: Task, fleet: Fleet, spares: Spares, where: Any) -> tuple[list[Any], Any]:
-    fleet = fleets.follow(fleet, spares, where)
-    return _leaves(fleet), fleets.seen(task, fleet.episode)
-
-
-def _draw(task: Task, fleet: Fleet, spares: Spares, lanes: Any, numbers: Any) -> list[Any]:
-    return bundled(fleets.draw(task, fleet, spares, lanes, numbers))
-
-
-def _leaves(tree: Any) -> list[Any]:
-    return jax.tree.leaves(tree)
-
-
-def _stepper(mode: str) -> Any:
-    def step(task: Task, fleet: Fleet, spares: Spares, actions: Any) -> tuple[Any, ...]:
-        fleet, made = fleets.step(task, mode, fleet, spares, actions)
-        return _leaves(fleet), made.observation, made.final, *packed(made.decision)
-
-    return step
-
-
-_STEP = {mode: _stepper(mode) for mode in (fleets.NEXT_STEP, fleets.SAME_STEP, fleets.DISABLED)}
+_WORTH_A_THREAD = 2048
+"""Control periods of worlds in one step; handing them to another thread takes as long as half of them."""
+_THOUGHTFUL_WORTH = 32
+"""Worlds, behind a shield that thinks ahead."""
 
 
 @final
@@ -67,7 +41,10 @@ class PursuedVectorEnv(VectorEnv):
     `info["final_info"]`; `DISABLED` when `reset(options={"reset_mask": mask})` says so.
 
     `reset(seed=s)` seeds world i with s + i; a list gives each its own. World i then goes through the same
-    episodes as a `PursuedEnv` with that seed, to rounding. Arrays in `info` are read-only views.
+    episodes as a `PursuedEnv` with that seed, to rounding.
+
+    The worlds are shared among `threads`, at most; if not given, among as many as there are cores and find
+    enough to do. How many there are changes nothing but the time.
     """
 
     # Each has its own, with its own pictures per second.
@@ -87,15 +64,14 @@ class PursuedVectorEnv(VectorEnv):
         reward_scale: float = 1.0,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        threads: int | None = None,
         **fields: Any,
     ):
-        if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise ValueError(f"num_envs = {num_envs!r}: it must be a whole number of at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode = {render_mode!r}: many worlds are drawn as 'rgb_array' only")
         super().__init__()
         self.render_mode = check_render_mode(render_mode)
-        self.num_envs = int(num_envs)
+        self.num_envs = whole_number("num_envs", num_envs)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -112,28 +88,67 @@ class PursuedVectorEnv(VectorEnv):
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._task, self._layout = bundled(self.task), bundle_of(self.task)
+        count = self._useful_threads(threads)
+        size = self.num_envs // count
+        cuts = [slice(part * size, (part + 1) * size) for part in range(count)]
+        self._parts = [Part(self.task, self.autoreset_mode.value, cut) for cut in cuts]
+        self._pool: ThreadPoolExecutor | None = None
+        self._compiled: set[str] = set()
         self._words = np.zeros((2, self.num_envs), np.uint32)
         # Numbers of the episodes that run, and of the last one of each lane whose start has been drawn.
         self._numbers = np.full(self.num_envs, -1, np.int32)
         self._drawn = self._numbers.copy()
         self._ended = np.ones(self.num_envs, bool)
-        self._fleet: list[Any] | None = None
-        self._spares: list[Any] = []
+        self._launched = False
+
+    def _useful_threads(self, most: int | None) -> int:
+        """As many as find enough to do, in equal parts: each number of worlds compiles anew."""
+        if most is not None and (
+            isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1
+        ):
+            raise ValueError(f"threads = {most!r}: it must be a whole number of at least 1")
+        if runs_on_host(self.task.pursuer, self.scenario):
+            return 1
+        if self.task.shield.rows_only is self.task.shield:
+            worth = self.num_envs * self.task.decision_steps // _WORTH_A_THREAD
+        else:
+            worth = self.num_envs // _THOUGHTFUL_WORTH
+        count = useful_threads(max(1, worth if most is None else min(most, self.num_envs)))
+        return next(part for part in range(count, 0, -1) if self.num_envs % part == 0)
+
+    def _each(self, name: str, work: Callable[[Part], Any]) -> list[Any]:
+        """Let every part do its work, in threads; the first time one by one: all compile the same."""
+        first, *others = self._parts
+        if not others or name not in self._compiled:
+            self._compiled.add(name)
+            return [work(part) for part in self._parts]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(len(others))
+        running = [self._pool.submit(work, part) for part in others]
+        try:
+            mine = work(first)
+        finally:
+            wait(running)
+        return [mine, *(one.result() for one in running)]
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
 
     @property
     def worlds(self) -> World:
         """All worlds as they are now, with their axis in front. **Raises** `ResetNeeded` before a `reset`."""
-        episode = jax.tree.unflatten(self._layouts[1], self._now()).episode
-        return jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), -1, 0), episode.world)
+        self._check_launched()
+        worlds = [part.world for part in self._parts]
+        return jax.tree.map(
+            lambda *leaves: np.concatenate([np.moveaxis(np.asarray(leaf), -1, 0) for leaf in leaves]), *worlds
+        )
 
-    def _now(self) -> list[Any]:
-        if self._fleet is None:
+    def _check_launched(self) -> None:
+        if not self._launched:
             raise gymnasium.error.ResetNeeded("call reset() before anything else")
-        return self._fleet
-
-    def _parts(self) -> tuple[list[Any], ...]:
-        return self._task, self._now(), self._spares
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -146,22 +161,17 @@ class PursuedVectorEnv(VectorEnv):
         fresh = self._seed(seed)
         self._numbers = np.where(fresh, 0, self._numbers + 1).astype(np.int32)
         self._drawn = self._numbers.copy()
-        launch = flat(_launch, self._layout)
-        self._fleet, self._spares, observation = launch((self._task,), self._words, self._numbers)
-        fleet = jax.eval_shape(fleets.launch, self.task, self._words, self._numbers)
-        spares = bundle_of(jax.eval_shape(fleets.no_spares, fleet))
-        self._layouts = self._layout, jax.tree.structure(fleet), spares
+        observations = self._each("launch", lambda part: part.launch(self._words, self._numbers))
+        self._launched = True
         if "world" in told:
             world = given_world(self.scenario, told["world"], (self.num_envs,))
-            leaves, structure = jax.tree.flatten(world)
-            place = flat(_place, *self._layouts[:2], structure)
-            self._fleet, observation = place((self._task, self._now(), leaves))
+            observations = self._each("place", lambda part: part.place(world))
         self._ended = np.zeros(self.num_envs, bool)
-        return np.array(observation), {}
+        return np.concatenate(observations), {}
 
     def _seed(self, seed: Any) -> np.ndarray:
         """Take new seeds; which worlds got one."""
-        if seed is None and self._fleet is None:
+        if seed is None and not self._launched:
             seed = self.np_random_seed
         if seed is None:
             return np.zeros(self.num_envs, bool)
@@ -189,12 +199,12 @@ class PursuedVectorEnv(VectorEnv):
             raise ValueError(
                 "options['reset_mask'] starts the next episodes of these worlds; it takes no seed"
             )
-        self._now()
+        self._check_launched()
         self._draw_ahead()
-        self._fleet, observation = flat(_follow, *self._layouts)(self._parts(), mask)
+        observations = self._each("follow", lambda part: part.follow(mask))
         self._numbers[mask] += 1
         self._ended &= ~mask
-        return np.array(observation), {}
+        return np.concatenate(observations), {}
 
     def _draw_ahead(self) -> None:
         """Draw the next starts of all lanes, if one has none left."""
@@ -203,12 +213,7 @@ class PursuedVectorEnv(VectorEnv):
         ahead = self._drawn[:, None] + np.arange(1, AHEAD + 1, dtype=np.int32)
         lanes, which = np.nonzero(ahead <= self._numbers[:, None] + AHEAD)
         numbers = ahead[lanes, which]
-        draw, chunk = flat(_draw, *self._layouts), min(_DRAWN_AT_ONCE, AHEAD * self.num_envs)
-        for first in range(0, len(lanes), chunk):
-            some = np.full((2, chunk), self.num_envs, np.int32)
-            part = lanes[first : first + chunk], numbers[first : first + chunk]
-            some[:, : len(part[0])] = part
-            self._spares = draw(self._parts(), some[0], some[1])
+        self._each("draw", lambda part: part.draw(lanes, numbers))
         self._drawn = self._numbers + AHEAD
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -220,9 +225,11 @@ class PursuedVectorEnv(VectorEnv):
                 )
         else:
             self._draw_ahead()
-        made = self.program(checked_action(actions, (self.num_envs, 2)))
-        self._fleet, observation, final, floats, whole = made
-        reward, info = unpacked(floats, whole)
+        self._check_launched()
+        actions = checked_action(actions, (self.num_envs, 2))
+        made = zip(*self._each("step", lambda part: part.step(actions)), strict=True)
+        observation, final, floats, whole = made
+        reward, info = unpacked(np.concatenate(floats, axis=-1), np.concatenate(whole))
         truncated = info["timed_out"]
         terminated = info["captured"] | info["collided"] | info["reached"]
         if mode is AutoresetMode.NEXT_STEP:
@@ -230,16 +237,19 @@ class PursuedVectorEnv(VectorEnv):
             info = self._masked(info, ~begun)
         else:
             begun = terminated | truncated
-            info = self._final(info, final, begun) if mode is AutoresetMode.SAME_STEP else self._masked(info)
+            if mode is AutoresetMode.SAME_STEP:
+                info = self._final(info, np.concatenate(final), begun)
+            else:
+                info = self._masked(info)
         self._ended = terminated | truncated
         reward = reward.astype(np.float64)
         if mode is not AutoresetMode.DISABLED:
             self._numbers = self._numbers + begun
-        return np.array(observation), reward, terminated, truncated, info
+        return np.concatenate(observation), reward, terminated, truncated, info
 
-    def program(self, actions: Float[np.ndarray, "worlds 2"]) -> tuple[Any, ...]:
-        """What `step` computes, as arrays of the device, without taking the step."""
-        return flat(_STEP[self.autoreset_mode.value], *self._layouts)(self._parts(), actions)
+    def program(self, actions: Float[np.ndarray, "worlds 2"]) -> list[tuple[Any, ...]]:
+        """What `step` computes, as arrays of the device and part by part, without taking the step."""
+        return self._each("step", lambda part: jax.block_until_ready(part.program(actions)))
 
     def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
         """Vector infos: beside each entry, which worlds have it."""
