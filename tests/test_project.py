@@ -125,6 +125,7 @@ def test_docs_name_scenario_constants_that_exist():
 
 # Examples of packages that the lock does not hold, and what to tell them so that they are soon done.
 NEEDS = {
+    "train_many_worlds.py": ("stable_baselines3", "stable-baselines3"),
     "train_with_sb3.py": ("stable_baselines3", "stable-baselines3"),
     "train_with_sbx.py": ("sbx", "sbx-rl"),
 }

@@ -81,6 +81,49 @@ def test_stable_baselines_checker_finds_nothing_to_complain_of():
     check(PursuedEnv(**TASK))
 
 
+@pytest.mark.parametrize("every_info", [False, True])
+def test_stable_baselines_gets_many_worlds_in_its_own_form(every_info):
+    if importlib.util.find_spec("stable_baselines3") is None:
+        with pytest.raises(ValueError, match=r"pip install torch==2\.13\.0"):
+            importlib.import_module("sidestep.bridges.gym.stable_baselines")
+        return
+    from stable_baselines3 import TD3
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from sidestep.bridges.gym.stable_baselines import PursuedVecEnv
+
+    worlds, seed = 4, 3
+    env = PursuedVecEnv(worlds, every_info=every_info, **TASK)
+    alone = [PursuedEnv(**TASK) for _ in range(worlds)]
+    env.seed(seed)
+    observations = env.reset()
+    for lane, one in enumerate(alone):
+        np.testing.assert_allclose(one.reset(seed=seed + lane)[0], observations[lane], atol=1e-5)
+    random, ends = np.random.default_rng(0), 0
+    for _ in range(150):
+        actions = np.clip(AHEAD + 0.2 * random.normal(size=(worlds, 2)), -1.0, 1.0).astype(np.float32)
+        observations, rewards, dones, infos = env.step(actions)
+        for lane, one in enumerate(alone):
+            expected, reward, terminated, truncated, info = one.step(actions[lane])
+            assert rewards[lane] == pytest.approx(reward, rel=1e-4, abs=1e-4)
+            assert dones[lane] == (terminated or truncated)
+            assert infos[lane]["cost"] == info["cost"]
+            if dones[lane]:
+                ends += 1
+                assert infos[lane]["TimeLimit.truncated"] is truncated
+                np.testing.assert_allclose(infos[lane]["terminal_observation"], expected, atol=1e-4)
+                expected, _ = one.reset()
+            if dones[lane] or every_info:
+                assert info.keys() <= infos[lane].keys()
+            np.testing.assert_allclose(observations[lane], expected, atol=1e-4)
+    assert ends > 5
+    model = TD3("MlpPolicy", VecMonitor(env), learning_starts=8, batch_size=8, seed=0)
+    model.learn(40)
+    assert env.get_attr("num_envs", indices=[0, 2]) == [worlds, worlds]
+    assert env.env_is_wrapped(VecMonitor) == [False] * worlds
+    env.close()
+
+
 def test_seeds_play_the_episodes_of_an_evaluation_one_after_the_other():
     class Policy:
         decision_steps = HOLD
@@ -244,6 +287,8 @@ def test_an_action_that_is_not_a_number_stops_the_robot_and_is_reported():
     env.reset(seed=0, options=at())
     observation, reward, _, _, info = env.step(np.array([np.nan, 0.0], np.float32))
     assert info["status"] == Status.INVALID
+    # What was proposed, not what was made of it.
+    np.testing.assert_array_equal(info["proposed"], [np.nan, 0.0])
     assert np.all(np.isfinite(observation))
     assert np.isfinite(reward)
     np.testing.assert_allclose(env.world.evader, 0.0, atol=1e-6)

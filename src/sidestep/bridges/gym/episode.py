@@ -91,7 +91,7 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
     """
     scenario, start = task.scenario, episode.world
     action = real(action)
-    nominal = nominal_velocity(scenario, start, action)
+    nominal, finite = nominal_velocity(scenario, start, action), jnp.all(jnp.isfinite(action), axis=0)
     # Unused, and so not computed, where the pursuer draws nothing.
     keys = lane_by_lane(lambda *of: _keys(*of)[1], start.lanes, episode.words, episode.number)
 
@@ -110,7 +110,7 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
             timed_out=events.timed_out,
             status=result.status,
             intervention=result.intervention,
-            proposed=limit_speed(action, real(1.0)),
+            proposed=jnp.where(finite, limit_speed(action, real(1.0)), action),
             executed=result.action,
             pursuer_clearance=events.pursuer_clearance,
             obstacle_clearance=events.obstacle_clearance,
