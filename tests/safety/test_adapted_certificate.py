@@ -1,15 +1,17 @@
 """Robots of one's own where a part of the package knows the built-in ones only: taken over, or refused."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
 
 from sidestep.cli import main
-from sidestep.safety import certify, covered, of_control_point
+from sidestep.pursuit import CaptureGame
+from sidestep.safety import SHIELDS, certify, covered, make_shield, of_control_point
 from sidestep.views.outlines import LevelOutlines, pursuer_heights
 from sidestep.views.scene import capture_set_outline
-from sidestep.world import PursuerModel, load_scenario
+from sidestep.world import ModelWarning, PursuerModel, load_scenario
 
 
 class Nameless(PursuerModel):
@@ -43,6 +45,23 @@ def test_a_certificate_needs_a_drive_that_covers_the_pursuer(scenario):
         certify(dataclasses.replace(scenario, pursuer_model=Nameless()), check_shield=False)
     with pytest.raises(ValueError, match=r"half_axle = 0\.3: the pursuer is of the model Aircraft"):
         certify(scenario, half_axle=0.3, check_shield=False)
+
+
+def test_robots_against_which_the_pursuer_wins_are_warned_of_once(scenario):
+    allowed = float(CaptureGame.of(covered(of_control_point(scenario))).largest_capture_distance)
+    more = allowed - float(of_control_point(scenario).capture_distance)
+    near = dataclasses.replace(scenario, capture_distance=scenario.capture_distance + 0.9 * more)
+    beyond = dataclasses.replace(scenario, capture_distance=scenario.capture_distance + 1.1 * more)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in SHIELDS:
+            make_shield(name, near)
+        for name in ("none", "paper"):
+            make_shield(name, beyond)
+    for name in ("game", "joint"):
+        with pytest.warns(ModelWarning, match=f"{allowed:.3g} m is the most") as told:
+            make_shield(name, beyond)
+        assert len(told) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,12 @@
 """Every shield and every barrier by name."""
 
 import dataclasses
+import warnings
 
+import jax
+from jax.core import Tracer
+
+from sidestep.pursuit.game import CaptureGame
 from sidestep.safety.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.barrier_shield import shield_of
 from sidestep.safety.barriers import Barrier, ObstacleBarrier, RangeBarrier
@@ -9,6 +14,7 @@ from sidestep.safety.budget import Budget
 from sidestep.safety.joint import JointShield
 from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.shields import GameShield, NoShield, PaperShield, Shield
+from sidestep.world.model_probe import ModelWarning
 from sidestep.world.scenario import Scenario
 
 SHIELDS: dict[str, type[Shield]] = {
@@ -33,7 +39,8 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     """The shield `name` (a key of `SHIELDS`) for a scenario; `budget` for `game` and `joint` only.
 
     **Raises** `ValueError` naming the known shields, or what is wrong with the budget. **Warns**
-    `BudgetWarning` once where the budget is more than the game leaves.
+    `BudgetWarning` once where the budget is more than the game leaves, `ModelWarning` where robots of one's
+    own leave an evader that can be caught.
 
     With robots of one's own (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
     """
@@ -43,6 +50,8 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         guarded = of_control_point(scenario)
         # The others say nothing of what a pursuer can do.
         guarded = covered(guarded) if name in BUDGETED else dataclasses.replace(guarded, pursuer_model=None)
+        if name in BUDGETED:
+            _announce_beyond(guarded)
         return AdaptedShield(scenario, make_shield(name, guarded, budget))
     if budget is None:
         return SHIELDS[name](scenario)
@@ -50,6 +59,23 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         raise ValueError(f"the shield {name!r} keeps no budget; use 'game' or 'joint'")
     budget.announce(scenario)
     return BUDGETED[name](scenario, budget=budget)
+
+
+def _announce_beyond(guarded: Scenario) -> None:
+    """Warn where a pursuer wins against the problem that covers that of robots of one's own."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(guarded)):
+        return
+    allowed, kept = float(CaptureGame.of(guarded).largest_capture_distance), float(guarded.capture_distance)
+    if kept > allowed:
+        speed, axle = float(guarded.pursuer_speed), float(guarded.pursuer_half_axle)
+        warnings.warn(
+            f"with these robots the evader's control point has to keep {kept:.3g} m away from a drive of rim "
+            f"speed {speed:.3g} m/s and half axle {axle:.3g} m, and against a good one {allowed:.3g} m is "
+            "the most: it may be caught. A smaller `offset`, a `covering` drive that can do less, or a "
+            "faster evader would change that",
+            ModelWarning,
+            stacklevel=3,
+        )
 
 
 def as_shield(shield: str | Shield | Barrier, scenario: Scenario) -> Shield:
