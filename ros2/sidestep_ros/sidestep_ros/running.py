@@ -11,7 +11,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from sidestep._compiled import thread_limits
+from sidestep._compiled import keep_compiled_programs, thread_limits
 from sidestep_ros.parameters import ConfigurationError
 
 _LOOK_AROUND = 0.1
@@ -21,11 +21,12 @@ def tune_jax() -> None:
     """Settings for single small decisions; the user's environment comes first. Call it before JAX is there.
 
     One thread: a decision is too small to share, and the other cores have robots to drive. The thread that
-    asks computes: waking another takes longer than most decisions.
+    asks computes: waking another takes longer than most decisions. What was compiled is kept for the next start.
     """
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     for name, value in thread_limits(1).items():
         os.environ.setdefault(name, value)
+    keep_compiled_programs()
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
