@@ -1,4 +1,4 @@
-"""Many worlds as one Gymnasium vector environment, all stepped in one compiled call."""
+"""Many worlds as one Gymnasium vector environment, stepped in one compiled call for each core."""
 
 from __future__ import annotations
 
@@ -103,10 +103,8 @@ class PursuedVectorEnv(VectorEnv):
 
     def _useful_threads(self, most: int | None) -> int:
         """As many as find enough to do, in equal parts: each number of worlds compiles anew."""
-        if most is not None and (
-            isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1
-        ):
-            raise ValueError(f"threads = {most!r}: it must be a whole number of at least 1")
+        if most is not None:
+            most = whole_number("threads", most)
         if runs_on_host(self.task.pursuer, self.scenario):
             return 1
         if self.task.shield.rows_only is self.task.shield:
