@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3 learns in 256 worlds at once, behind `game`; then the policy is run behind `joint`.
+"""PPO of Stable-Baselines3 learns in 256 worlds at once behind `game`, and is then run behind `joint`.
 
 pip install torch==2.13.0 && pip install stable-baselines3 'sidestep[gym]'
 python examples/train_many_worlds.py

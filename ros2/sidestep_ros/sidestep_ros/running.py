@@ -21,7 +21,7 @@ def tune_jax() -> None:
     """Settings for single small decisions; the user's environment comes first. Call it before JAX is there.
 
     One thread: a decision is too small to share, and the other cores have robots to drive. The thread that
-    asks computes: waking another takes longer than most decisions. What was compiled is kept for the next start.
+    asks computes: waking another takes longer than most decisions. What was compiled is kept on disk.
     """
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     for name, value in thread_limits(1).items():

@@ -69,6 +69,7 @@ def _bars(axes: Axes, values: dict[str, float], unit: str, digits: Callable[[flo
             textcoords="offset points",
             va="center",
             fontsize=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
         )
     axes.set_xlabel(unit)
     axes.margins(x=0.16)
