@@ -7,7 +7,7 @@ import time
 import jax
 import pytest
 
-from sidestep._threads import cores, side_by_side, useful_threads
+from sidestep._threads import allowed_threads, side_by_side, useful_threads
 
 
 def counted(count, names, pause=0.0):
@@ -79,12 +79,12 @@ def test_an_error_here_ends_all_threads(error):
 
 def test_no_more_threads_than_xla_may_have(monkeypatch):
     monkeypatch.setenv("PJRT_NPROC", "1")
-    assert cores() == 1
+    assert allowed_threads() == 1
     assert useful_threads(100) == 1
     monkeypatch.delenv("PJRT_NPROC")
-    assert 1 <= cores() <= (os.cpu_count() or 1)
+    assert 1 <= allowed_threads() <= (os.cpu_count() or 1)
     assert useful_threads(1) == 1
-    assert useful_threads(100) == cores()
+    assert useful_threads(100) == allowed_threads()
 
 
 def test_settings_of_one_thread_keep_the_work_in_it():

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Bool, Float, Int
 
@@ -78,6 +79,11 @@ def _inside(function: Callable[..., Any], *arguments: Any) -> Any:
     # What is inside may be inlined there.
     with set_xla_metadata(inlineable=None):
         return function(*arguments)
+
+
+def traced(tree: Any) -> bool:
+    """Whether anything in it is known only when the program that is being compiled runs."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def whole_number(name: str, value: Any) -> int:

@@ -10,6 +10,11 @@ _LARGEST = 1 << 30
 """Bytes; beyond that JAX deletes what was used longest ago."""
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def thread_limits(threads: int) -> dict[str, str]:
     """Environment variables with which JAX, and the libraries that NumPy calls, compute in so many threads.
 

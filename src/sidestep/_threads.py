@@ -15,6 +15,8 @@ from typing import TypeVar
 
 import jax
 
+from sidestep._compiled import cores
+
 _SETTINGS = (
     "jax_enable_x64",
     "jax_disable_jit",
@@ -26,11 +28,10 @@ _SETTINGS = (
 T = TypeVar("T")
 
 
-def cores() -> int:
-    """Cores that this process may use; fewer where `PJRT_NPROC` allows JAX fewer threads."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def allowed_threads() -> int:
+    """One for each core that this process may use; fewer where `PJRT_NPROC` allows JAX fewer."""
     told = os.environ.get("PJRT_NPROC", "")
-    return min(count, int(told)) if told.isdigit() and int(told) > 0 else count
+    return min(cores(), int(told)) if told.isdigit() and int(told) > 0 else cores()
 
 
 def useful_threads(most: int) -> int:
@@ -39,7 +40,7 @@ def useful_threads(most: int) -> int:
     One where an accelerator computes, and where JAX's settings hold for this thread only, as those of
     `with jax.enable_x64(True)` do.
     """
-    count = min(cores(), most)
+    count = min(allowed_threads(), most)
     if count <= 1 or jax.default_backend() != "cpu":
         return 1
     with ThreadPoolExecutor(1) as pool:

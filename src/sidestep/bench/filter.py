@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from sidestep._compiled import cores
 from sidestep.bench.children import Case
-from sidestep.bench.machine import cores, synchronous_dispatch
+from sidestep.bench.machine import synchronous_dispatch
 from sidestep.bench.timing import durations, first_call, spread
 
 LIMIT = 0.18

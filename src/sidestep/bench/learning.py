@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from sidestep._compiled import cores
 from sidestep.bench.children import Case
-from sidestep.bench.machine import cores
 from sidestep.bench.timing import durations, first_call, spread
 
 BATCH, HIDDEN, WARMUP, BUFFER = 256, [256, 256], 256, 10_000

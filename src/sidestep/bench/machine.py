@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sidestep._compiled import thread_limits
+from sidestep._compiled import cores, thread_limits
 
 PACKAGES = (
     "sidestep", "jax", "jaxlib", "equinox", "optax", "numpy", "scipy", "torch", "stable-baselines3", "sbx-rl",
@@ -39,11 +39,6 @@ def processor() -> str:
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or "unknown"
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def load() -> float | None:

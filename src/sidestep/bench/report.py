@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sidestep._compiled import cores
 from sidestep.bench import machine
 from sidestep.bench.children import run_case
 from sidestep.bench.sections import SECTIONS, section
@@ -16,7 +17,7 @@ def run_section(name: str, quick: bool, say: Callable[[str], None]) -> dict[str,
     """Every case of a section, one after the other, with where and when; `say` is told of each as it ends."""
     module, begun = section(name), time.time()
     load = machine.load()
-    if load is not None and load > 0.5 * machine.cores():
+    if load is not None and load > 0.5 * cores():
         say(f"[yellow]something else runs here (load {load:.1f}): figures suffer[/yellow]")
     measured = []
     for case in module.cases(quick):

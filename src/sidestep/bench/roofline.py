@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from sidestep._compiled import cores
 from sidestep.bench.children import Case
 from sidestep.bench.learning import BATCH, HIDDEN, training
-from sidestep.bench.machine import cores
 from sidestep.bench.timing import durations, spread
 
 Product = tuple[str, int, int, int]

@@ -81,6 +81,10 @@ class AdaptedShield(Shield):
         return AdaptedShield(self.scenario, self.inner.rows_only)
 
     @property
+    def looks_ahead(self) -> bool:
+        return self.inner.looks_ahead
+
+    @property
     def takes_lanes(self) -> bool:
         return self.inner.takes_lanes
 

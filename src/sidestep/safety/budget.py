@@ -6,12 +6,10 @@ import math
 import warnings
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from sidestep._arrays import Scalar, real
+from sidestep._arrays import Scalar, real, traced
 from sidestep.pursuit.game import CaptureGame
 from sidestep.world.scenario import Scenario
 
@@ -103,7 +101,7 @@ class Budget(eqx.Module):
 
         **Raises** as `check`. **Warns** `BudgetWarning`. Silent about traced values, which are not known yet.
         """
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((self, scenario))):
+        if traced((self, scenario)):
             return None
         self.check(scenario)
         excess = float(np.asarray(self.excess(scenario)))

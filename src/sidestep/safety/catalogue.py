@@ -3,9 +3,7 @@
 import dataclasses
 import warnings
 
-import jax
-from jax.core import Tracer
-
+from sidestep._arrays import traced
 from sidestep.pursuit.game import CaptureGame
 from sidestep.safety.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.barrier_shield import shield_of
@@ -63,7 +61,7 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
 
 def _announce_beyond(guarded: Scenario) -> None:
     """Warn where a pursuer wins against the problem that covers that of robots of one's own."""
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(guarded)):
+    if traced(guarded):
         return
     allowed, kept = float(CaptureGame.of(guarded).largest_capture_distance), float(guarded.capture_distance)
     if kept > allowed:

@@ -59,6 +59,11 @@ class Shield(eqx.Module):
         return self
 
     @property
+    def looks_ahead(self) -> bool:
+        """Whether it does more than rows, so that a decision costs thousands of times as much."""
+        return self.rows_only is not self
+
+    @property
     def takes_lanes(self) -> bool:
         """Whether it takes many worlds in lanes; others are asked for each (`filter_in_lanes`)."""
         return False

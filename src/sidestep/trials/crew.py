@@ -194,9 +194,8 @@ class Crew:
 
     def __iter__(self) -> Iterator[int]:
         """Run everything; yields now and then how many more episodes have ended."""
-        shield = self._trial.shield
-        light = getattr(shield, "rows_only", shield) is shield
-        steps = _CHUNK_STEPS if light else _THOUGHTFUL_STEPS
+        thoughtful = getattr(self._trial.shield, "looks_ahead", False)
+        steps = _THOUGHTFUL_STEPS if thoughtful else _CHUNK_STEPS
         while self._next < self._end or np.any(self._numbers >= 0):
             self._refill()
             yield self._go_on(max(1, steps // decision_steps_of(self._trial.policy)))

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import logging
-import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from sidestep._compiled import cores
 from sidestep.bridges.packages import needed
 
 LOCAL = "local"
 _CONNECT_SECONDS = 10
 _LOCAL_CONFIG = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask's web servers have nothing to tell: nobody asks them here."""
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from sidestep._arrays import Scalar, real
+from sidestep._arrays import Scalar, real, whole_number
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.world import Scenario, load_scenario
@@ -55,12 +55,7 @@ def make_task(
             raise ValueError(f"fields ({names}) go with a scenario's name or file, not with a Scenario")
     else:
         scenario = load_scenario(scenario, **fields)
-    if (
-        isinstance(decision_steps, bool)
-        or not isinstance(decision_steps, (int, np.integer))
-        or decision_steps < 1
-    ):
-        raise ValueError(f"decision_steps = {decision_steps!r}: it must be a whole number of at least 1")
+    decision_steps = whole_number("decision_steps", decision_steps)
     if not np.isfinite(reward_scale):
         raise ValueError(f"reward_scale = {reward_scale!r}: it must be a finite number")
     task = Task(
@@ -68,7 +63,7 @@ def make_task(
         shield=as_shield(shield, scenario),
         pursuer=as_pursuer(pursuer),
         reward_scale=real(reward_scale),
-        decision_steps=int(decision_steps),
+        decision_steps=decision_steps,
     )
     # A model of one's own may hold plain numbers.
     return jax.tree.map(lambda leaf: real(leaf) if isinstance(leaf, (int, float)) else leaf, task)

@@ -107,10 +107,10 @@ class PursuedVectorEnv(VectorEnv):
             most = whole_number("threads", most)
         if runs_on_host(self.task.pursuer, self.scenario):
             return 1
-        if self.task.shield.rows_only is self.task.shield:
-            worth = self.num_envs * self.task.decision_steps // _WORTH_A_THREAD
-        else:
+        if self.task.shield.looks_ahead:
             worth = self.num_envs // _THOUGHTFUL_WORTH
+        else:
+            worth = self.num_envs * self.task.decision_steps // _WORTH_A_THREAD
         count = useful_threads(max(1, worth if most is None else min(most, self.num_envs)))
         return next(part for part in range(count, 0, -1) if self.num_envs % part == 0)
 
