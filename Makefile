@@ -54,7 +54,8 @@ play: $(READY) ## Serve the page in which you try to catch the robot
 test: $(READY) ## Run the tests (those marked slow: make test ARGS='-m slow')
 	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)
 
-test-ros: $(ROS_READY) ## Test the ROS 2 package with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
+test-ros: $(ROS_READY) ## Types and tests of the ROS 2 package, with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
+	$(PY) -m pyright -p ros2
 	$(PY) ros2/private_network.py $(ROS_PY) -m pytest -q -c ros2/sidestep_ros/pytest.ini -n $(JOBS) --dist loadfile \
 	  ros2/sidestep_ros/test $(ARGS)
 

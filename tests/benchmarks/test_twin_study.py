@@ -60,7 +60,7 @@ def test_a_guarantee_that_was_broken_shows(study):
     block = {
         "scenario": "roomy", "base": "servo", "noise": 0.0, "delay": 0.0, "block": 0, "episodes": 10,
         "captured": 0, "collided": 1, "reached": 9, "timed_out": 0, "cut": 0,
-        "least_pursuer_distance": 0.18, "least_obstacle_distance": 0.19,
+        "least_pursuer_distance": 0.16, "least_obstacle_distance": 0.19,
     }  # fmt: skip
     lost = {**block, "block": 1, "captured": 2, "reached": 7, "least_pursuer_distance": 0.1499}
     said = [

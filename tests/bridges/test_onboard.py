@@ -222,6 +222,18 @@ def test_a_core_that_keeps_falling_behind_goes_without_looking_ahead_until_it_ke
     assert np.all(np.hypot(*np.diff(near.plan, axis=0).T) <= 0.1574 * 8.0 / 32 * 1.01)
 
 
+def test_the_look_ahead_knows_the_motors_and_how_fast_the_robot_is():
+    settings = OnboardSettings(motor_lag=0.02, motor_acceleration=2.0)
+    core = Onboard(SCENARIO, "joint", settings=settings)
+    assert float(core._shield.acceleration) == 2.0
+    for nimble in (OnboardSettings(), OnboardSettings(motor_acceleration=1000.0)):
+        assert Onboard(SCENARIO, "joint", settings=nimble)._shield.acceleration is None
+    rows = Onboard(SCENARIO, "game", settings=settings)
+    before, after = run(rows, 1).world.evader_velocity, run(rows, 30, 1).world.evader_velocity
+    np.testing.assert_allclose(before, 0.0)
+    np.testing.assert_allclose(after, WISH, atol=1e-3)
+
+
 def test_settings_and_targets_that_cannot_be_are_refused_with_all_that_is_wrong():
     with pytest.raises(ValueError, match=r"position_noise.*late_limit.*on_fault"):
         OnboardSettings(position_noise=-1.0, late_limit=0, on_fault="panic")

@@ -82,10 +82,12 @@ def test_motors_that_lag_and_have_a_limit_are_followed_exactly():
         change *= min(1.0, limit / max(np.linalg.norm(change), 1e-9))
         place, velocity = place + step * velocity, velocity + step * change
     np.testing.assert_allclose(track.at(0.3)[:2], place, atol=2e-6)
+    np.testing.assert_allclose(track.velocity_at(0.3), velocity, atol=2e-5)
     # The same in parts: what is known at one pose is the beginning of the next.
     track.take(0.22, track.at(0.22))
     track.take(0.25, track.at(0.25))
     np.testing.assert_allclose(track.at(0.3)[:2], place, atol=2e-6)
+    np.testing.assert_allclose(track.velocity_at(0.3), velocity, atol=2e-5)
 
 
 def test_averaging_poses_of_a_moving_robot_does_not_hold_it_back():

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sidestep._arrays import real
 from sidestep.pursuit import make_pursuer, pursue
-from sidestep.safety import GameShield, JointShield, PursuitBarrier, Status, make_shield
-from sidestep.safety.look_ahead import STRETCHES, WISHES, imagine, stretch, wish
+from sidestep.safety import Budget, GameShield, JointShield, PursuitBarrier, Status, make_shield
+from sidestep.safety.look_ahead import STRETCHES, WISHES, imagine, ramp, stretch, wish
 from sidestep.trials.keys import episode_key, start_and_pursuit
 from sidestep.world import World, load_scenario
 
@@ -72,7 +73,8 @@ def test_two_pursuers_close_in_on_the_rows_and_not_on_the_look_ahead():
     assert not captured.any()
 
 
-def test_an_imagined_chase_is_the_chase_that_follows():
+@pytest.mark.parametrize("acceleration", [None, 2.0])
+def test_an_imagined_chase_is_the_chase_that_follows(acceleration):
     """In the robot's own period, against the pursuer that is there, imagination must be exact."""
     scenario = load_scenario("paper", obstacle_count=2)
     names = ("pure-pursuit", "interceptor")
@@ -82,31 +84,46 @@ def test_an_imagined_chase_is_the_chase_that_follows():
     ways = jnp.array([[0, 5, 16, 18], [17, 17, 3, 19]], jnp.int32)
     ages, length = jnp.array([0.0, 0.2]), jnp.asarray(0.5)
 
+    def motors(velocity, wanted):
+        """The mean velocity of a period and the one at its end, in small steps."""
+        if acceleration is None:
+            return wanted, wanted
+
+        def piece(velocity, _):
+            lacking = wanted - velocity
+            size = jnp.maximum(jnp.sqrt(jnp.sum(lacking**2)), 1e-9)
+            after = velocity + jnp.minimum(acceleration * 0.05 / 200 / size, 1.0) * lacking
+            return after, 0.5 * (velocity + after)
+
+        end, ways = jax.lax.scan(piece, velocity, length=200)
+        return jnp.mean(ways, axis=0), end
+
     @jax.jit
     def both(world):
         sides = guard.init(world)
         spread = lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, 2, 2))  # noqa: E731
         outlook = imagine(
-            scenario, guard.heed, models, jax.tree.map(spread, world), spread(sides), ways, ages, length, 30
+            scenario, guard.heed, models, jax.tree.map(spread, world), spread(sides), ways, ages, length, 30,
+            None if acceleration is None else real(acceleration),
         )  # fmt: skip
 
         def follow(model, way, age):
             def step(carry, index):
-                world, sides = carry
+                world, sides, velocity = carry
                 now = age + index.astype(age.dtype) * scenario.control_period
                 wished = wish(scenario, world, sides, stretch(way, now, length))
                 result, sides = guard(world, wished, sides)
-                world, _ = scenario.step(
-                    world, result.action, pursue(scenario, model, world, jax.random.key(0))
-                )
+                driven, velocity = motors(velocity, result.action)
+                world, _ = scenario.step(world, driven, pursue(scenario, model, world, jax.random.key(0)))
+                world = eqx.tree_at(lambda world: world.evader_velocity, world, velocity)
                 distance = lambda other: jnp.sqrt(jnp.sum((other - world.evader) ** 2, axis=-1))  # noqa: E731
                 gap = jnp.minimum(
                     jnp.min(distance(world.pursuers[:, :2])) - scenario.capture_distance,
                     jnp.min(distance(world.obstacles[:, :2])) - scenario.collision_distance,
                 )
-                return (world, sides), gap
+                return (world, sides, velocity), gap
 
-            return jnp.min(jax.lax.scan(step, (world, sides), jnp.arange(30))[1])
+            return jnp.min(jax.lax.scan(step, (world, sides, world.evader_velocity), jnp.arange(30))[1])
 
         return outlook, jnp.stack(
             [jnp.stack([follow(model, *pair) for pair in zip(ways, ages, strict=True)]) for model in models]
@@ -351,3 +368,89 @@ def test_who_has_used_up_what_is_kept_beyond_the_distance_does_not_change_to_a_s
         np.testing.assert_array_equal(sides, np.sign(across))
         np.testing.assert_allclose(values, spare, atol=1e-6)
         assert np.min(later - values) > -1e-6
+
+
+def test_a_ramp_is_what_small_steps_at_that_acceleration_come_to():
+    rng = np.random.default_rng(3)
+    velocity, wanted = rng.uniform(-0.2, 0.2, (2, 2, 40))
+    acceleration, period, pieces = 2.0, 0.05, 4000
+    mean, end = ramp(jnp.asarray(velocity), jnp.asarray(wanted), real(acceleration), real(period))
+    now, way = velocity.copy(), np.zeros((2, 40))
+    for _ in range(pieces):
+        lacking = wanted - now
+        size = np.maximum(np.hypot(*lacking), 1e-12)
+        step = np.minimum(acceleration * period / pieces / size, 1.0) * lacking
+        way += (now + 0.5 * step) * period / pieces
+        now = now + step
+    np.testing.assert_allclose(end, now, atol=1e-6)
+    np.testing.assert_allclose(mean, way / period, atol=1e-5)
+    arrived = np.hypot(*(wanted - velocity)) <= acceleration * period
+    assert 5 < arrived.sum() < 35
+    for unlimited in (np.inf, 1e9):
+        mean, end = ramp(jnp.asarray(velocity), jnp.asarray(wanted), real(unlimited), real(period))
+        np.testing.assert_allclose(end, wanted, atol=1e-7)
+        np.testing.assert_allclose(mean, wanted, atol=1e-7)
+
+
+def _at_the_axis(count, seed):
+    """A pursuer backs after the evader, which is within 4 mm of its axis and has an obstacle ahead."""
+    rng = np.random.default_rng(seed)
+    heading = rng.uniform(-np.pi, np.pi, count)
+    ahead, across = -rng.uniform(0.262, 0.28, count), rng.uniform(-0.004, 0.004, count)
+    cosine, sine = np.cos(heading), np.sin(heading)
+    pursuers = np.stack([sine * across - cosine * ahead, -sine * ahead - cosine * across, heading], axis=-1)
+    way = heading + np.pi + rng.uniform(-0.9, 0.9, count)
+    apart = rng.uniform(0.28, 0.4, count)
+    obstacles = np.stack(
+        [apart * np.cos(way), apart * np.sin(way), np.full(count, 0.02), np.zeros(count)], axis=-1
+    )
+    worlds = jax.vmap(
+        lambda pursuer, obstacle, velocity: World(
+            jnp.zeros(2), pursuer, obstacle, jnp.ones(2), evader_velocity=velocity
+        )
+    )(pursuers[:, None], obstacles[:, None], -0.1574 * np.stack([cosine, sine], axis=-1))
+    return worlds, 0.1574 * np.stack([-sine, cosine], axis=-1)
+
+
+@pytest.mark.parametrize("acceleration, depends", [(None, True), (2.0, False)])
+def test_a_wish_that_is_not_driven_changes_no_side_of_a_robot_with_motors(acceleration, depends):
+    """Where nothing is clear the way that touches last is driven, and that is no matter of the wish."""
+    scenario = load_scenario("paper-test")
+    budget = Budget(position_error=0.002, heading_error=0.002, delay=0.02)
+    shield = JointShield(scenario, budget=budget, acceleration=acceleration)
+    worlds, left = _at_the_axis(48, 0)
+
+    @jax.jit
+    @jax.vmap
+    def ask(world, nominal):
+        memory = shield.init(world)
+        result, after = shield(world, nominal, memory)
+        through, _ = shield.rows_only(world, nominal, memory.sides)
+        rejected = ~after.counts & jnp.any(jnp.abs(result.action - through.action) > 1e-6)
+        return result.action, rejected
+
+    one, other = ask(worlds, left), ask(worlds, -left)
+    rejected = np.asarray(one[1] & other[1])
+    assert rejected.sum() > 15
+    differ = np.abs(np.asarray(one[0] - other[0])).max(axis=-1) > 1e-4
+    assert differ[rejected].any() == depends
+
+
+def test_a_robot_with_motors_goes_on_looking_ahead_until_well_away():
+    """A look-ahead that sets in and breaks off would have it turn to and fro."""
+    scenario = load_scenario("paper-test")
+    looked = {}
+    for acceleration in (None, 2.0):
+        shield = JointShield(scenario, acceleration=acceleration)
+
+        @jax.jit
+        def ask(gap, memory, shield=shield):
+            obstacle = jnp.array([[scenario.collision_distance + gap, 0.0, 0.0, 0.0]])
+            world = World(jnp.zeros(2), jnp.array([[0.0, 0.5, 0.0]]), obstacle, jnp.array([-1.0, 0.0]))
+            memory = shield.init(world) if memory is None else memory
+            return shield(world, jnp.array([-0.1, 0.0]), memory)[1]
+
+        far = ask(0.9, None)
+        near = ask(0.7, far)
+        looked[acceleration] = [bool(one.looked) for one in (far, near, ask(0.9, near), ask(1.1, near))]
+    assert looked == {None: [False, True, False, False], 2.0: [False, True, True, False]}

@@ -1,5 +1,6 @@
 """Start and end of a node: nothing wrong may start, nothing slow may be left for the loop."""
 
+import math
 import re
 import signal
 
@@ -84,6 +85,23 @@ def test_policy_node_compiles_nothing_in_its_loop_and_takes_only_targets_that_ca
     assert not re.search(r"ompiling|Finished tracing", since), since
     assert node.stop(signal.SIGTERM) == 0
     assert robots.command() == (0.0, 0.0)
+
+
+def test_robot_told_to_stop_on_faults_does_not_flee(start, robots, report):
+    node = start("shield_node", "shield:=game", "on_fault:=stop", "diagnostics_period:=0.0").wait_ready()
+    robots.nominal = (0.05, 0.0)
+    wait_until(lambda: level(robots) == "normal", "a normal decision")
+    wait_until(lambda: math.hypot(*robots.command()) > 0.01, "motion")
+    for robot in ("pursuer", "obstacle"):
+        robots.spoil[robot] = lambda message: None
+        status = heard(robots, "decisions", "stale", "stop")
+        assert "standing still" in status.message
+        assert wait_until(lambda: robots.command() == (0.0, 0.0), "a stop")
+        report(f"fault: on_fault: stop, no pose of the {robot}: stop | {status.message}")
+        robots.spoil.clear()
+        wait_until(lambda: level(robots) == "normal", "all to be well again")
+        wait_until(lambda: math.hypot(*robots.command()) > 0.01, "motion again")
+    assert node.stop() == 0, node.said
 
 
 def test_clock_that_goes_back_begins_anew(start, robots):

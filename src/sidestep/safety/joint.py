@@ -13,7 +13,7 @@ from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, select
 from sidestep.pursuit import Pursuer, make_pursuer, pursue
 from sidestep.safety.budget import Budget
 from sidestep.safety.by_need import by_need
-from sidestep.safety.look_ahead import STRETCHES, WISHES, Outlook, clearance, imagine, stretch, wish
+from sidestep.safety.look_ahead import STRETCHES, WISHES, Outlook, clearance, imagine, moved, stretch, wish
 from sidestep.safety.shields import GameShield, Shield, ShieldResult
 from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario
@@ -26,6 +26,11 @@ _FORGET = 0.9
 _SURPRISED = 0.1
 _GIVE = 0.001
 _PAUSE = 0.15
+_LEAVE = 1.25
+
+
+def _real_or_none(value: Any) -> Any:
+    return None if value is None else real(value)
 
 
 class JointMemory(eqx.Module):
@@ -34,7 +39,7 @@ class JointMemory(eqx.Module):
     `sides (m,)` of the pursuit barrier; `way (stretches,)` the way out that it counts on, if `counts`,
     followed for `age` (s); `pause` the time (s) for which no other is sought; `expected (models, m, 2)` the
     wheel speeds (m/s) that each model would have driven last, and `surprise (models,)` by how much it was
-    wrong of late, as a share of the wheel speed; `calls ()` so far.
+    wrong of late, as a share of the wheel speed; `calls ()` so far; whether it `looked` ahead last time.
     """
 
     sides: Float[Array, "m"]
@@ -45,6 +50,7 @@ class JointMemory(eqx.Module):
     expected: Float[Array, "models m 2"]
     surprise: Float[Array, "models"]
     calls: Int[Array, ""]
+    looked: Flag
 
 
 class _Decision(eqx.Module):
@@ -60,12 +66,13 @@ class _Decision(eqx.Module):
 
 class _Situation(eqx.Module):
     """What a decision is made from: the `action` that the rows let through, the `sides` that they follow for
-    it, and the `wheels` (m/s) that each model would drive now."""
+    it, the `held` ones that count if it is not driven, and the `wheels` (m/s) that each model would drive."""
 
     world: World
     memory: JointMemory
     action: Float[Array, "2"]
     sides: Float[Array, "m"]
+    held: Float[Array, "m"]
     wheels: Float[Array, "models m 2"]
     live: Array
     key: PRNGKeyArray
@@ -88,12 +95,17 @@ class JointShield(Shield):
 
     It is run only near: `near_obstacle` and `near_pursuer` bound the clearance of the nearest obstacle and
     the pursuit barrier's value (m) up to which the rows cannot vouch on their own. Clear means `margin` (m)
-    away from obstacles, or what there is now if that is less. `pursuer_gain` (1/s) replaces the scenario's:
-    a larger one leaves more room to move, and to change sides close to a pursuer's axis. A chase is imagined
+    away from obstacles, or what there is now if that is less. `pursuer_gain` (1/s) replaces the scenario's: a
+    larger one leaves more room to move, and to change sides close to a pursuer's axis. A chase is imagined
     `horizon` (s) ahead in `steps` periods, or in as many of the robot's own where those are longer. Periods
     longer than the robot's promise too much, because an evader gains on a pursuer that decides less often;
     `steps` is what a decision costs. With a `budget` the rows keep it (see `GameShield`), and clear means so
     much more. The decision carries no derivatives; the action does.
+
+    With an `acceleration` (m/s^2) imagined robots change their velocity no faster, from
+    `world.evader_velocity` on, which must be the robot's; to change sides then costs distance, and a side
+    that only the nominal action would change to counts as changed only where that is driven. To turn back and
+    forth costs as much, so what is near remains so up to 1.25 times as far.
     """
 
     scenario: Scenario
@@ -103,6 +115,7 @@ class JointShield(Shield):
     margin: Scalar = eqx.field(converter=real, default=0.02)
     horizon: Scalar = eqx.field(converter=real, default=8.0)
     budget: Budget | None = None
+    acceleration: Scalar | None = eqx.field(converter=_real_or_none, default=None)
     steps: int = eqx.field(static=True, default=160)
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 
@@ -126,6 +139,7 @@ class JointShield(Shield):
             expected=jnp.broadcast_to(world.wheel_speeds, (count, m, 2)),
             surprise=jnp.zeros(count, world.evader.dtype),
             calls=jnp.zeros((), jnp.int32),
+            looked=jnp.zeros((), bool),
         )
 
     def __call__(
@@ -138,9 +152,10 @@ class JointShield(Shield):
             return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides)
         # The rows of the nearest pursuer can be kept; whether those of anything beside it can is not said.
         towards_pursuers = jnp.sort(greedy.barriers[:m])
-        near = jnp.min(greedy.barriers[m:], initial=jnp.inf) <= self.near_obstacle
-        near |= jnp.min(towards_pursuers[1:], initial=jnp.inf) <= self.near_obstacle
-        need = near & (towards_pursuers[0] <= self.near_pursuer)
+        far = 1.0 if self.acceleration is None else jnp.where(memory.looked, _LEAVE, 1.0)
+        near = jnp.min(greedy.barriers[m:], initial=jnp.inf) <= far * self.near_obstacle
+        near |= jnp.min(towards_pursuers[1:], initial=jnp.inf) <= far * self.near_obstacle
+        need = near & (towards_pursuers[0] <= far * self.near_pursuer)
         # What is not known cannot be imagined.
         need &= greedy.status != Status.INVALID
 
@@ -153,14 +168,16 @@ class JointShield(Shield):
         models = tuple(make_pursuer(name) for name in self.models)
         key = jax.random.key(0)
         wheels = jnp.stack([pursue(self.scenario, model, world, key) for model in models])
+        # Who drives at once takes a change of sides back at no cost.
+        held = sides if self.acceleration is None else memory.sides
         situation = _Situation(
-            world, memory, greedy.action, sides, wheels, live, jax.random.fold_in(key, memory.calls)
+            world, memory, greedy.action, sides, held, wheels, live, jax.random.fold_in(key, memory.calls)
         )
         decision = self._look(need, situation)
 
         length = self.horizon / STRETCHES
-        chosen = wish(self.scenario, world, sides, stretch(decision.way, decision.age, length))
-        evasive, evasive_sides = game(world, chosen, sides)
+        chosen = wish(self.scenario, world, held, stretch(decision.way, decision.age, length))
+        evasive, evasive_sides = game(world, chosen, held)
         nominal = jnp.asarray(nominal, chosen.dtype)
         wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
         evasive = eqx.tree_at(
@@ -178,6 +195,7 @@ class JointShield(Shield):
             wheels,
             surprise,
             memory.calls + 1,
+            need,
         )
 
     def _look(self, need: Flag, situation: _Situation) -> _Decision:
@@ -208,14 +226,20 @@ class JointShield(Shield):
         is counted on, whether the one that is followed still comes to no contact."""
         now, memory = situation.world, situation.memory
         after = [
-            select(memory.counts, self.scenario.step(now, situation.action, wheels)[0], now)
+            select(memory.counts, self._stepped(now, situation.action, wheels), now)
             for wheels in situation.wheels
         ]
         worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1)[..., None], *after)
-        outlook = self._imagine(worlds, situation.sides, memory.way[None], memory.age[None])
+        sides = jnp.where(memory.counts, situation.sides, situation.held)
+        outlook = self._imagine(worlds, sides, memory.way[None], memory.age[None])
         # Where the action itself leads counts too.
         least = jnp.minimum(jnp.min(outlook.least), jnp.min(clearance(self.scenario, worlds)))
         return jnp.where(memory.counts, least >= self._floor(now), least > 0.0)
+
+    def _stepped(self, world: World, action: Float[Array, "2"], wheels: Float[Array, "m 2"]) -> World:
+        if self.acceleration is None:
+            return self.scenario.step(world, action, wheels)[0]
+        return moved(self.scenario, world, action, wheels, self.acceleration)
 
     def _floor(self, world: World) -> Scalar:
         """The clearance (m) that a way out must keep: the margin and the budget, or what there is now if that
@@ -241,12 +265,12 @@ class JointShield(Shield):
             lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, count, len(ways))),
             situation.world,
         )
-        outlook = self._imagine(worlds, situation.sides, ways, ages)
+        outlook = self._imagine(worlds, situation.held, ways, ages)
         least = jnp.min(outlook.least, axis=0)
         clear = least >= self._floor(situation.world)
         likely = jnp.min(jnp.where(situation.live[:, None], outlook.time, jnp.inf), axis=0)
         always = jnp.min(outlook.time, axis=0)
-        first = jax.vmap(lambda number: wish(self.scenario, situation.world, situation.sides, number))(
+        first = jax.vmap(lambda number: wish(self.scenario, situation.world, situation.held, number))(
             ways[:, 0]
         )
         correction = norm(first - situation.action)
@@ -273,4 +297,5 @@ class JointShield(Shield):
             ages,
             self.horizon / STRETCHES,
             self.steps,
+            self.acceleration,
         )

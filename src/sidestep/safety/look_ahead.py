@@ -72,6 +72,40 @@ def clearance(scenario: Scenario, world: World) -> Lanes:
     )
 
 
+def ramp(
+    velocity: Float[Array, "2 *lanes"],
+    wanted: Float[Array, "2 *lanes"],
+    acceleration: Scalar,
+    period: Scalar,
+) -> tuple[Float[Array, "2 *lanes"], Float[Array, "2 *lanes"]]:
+    """Mean velocity in a period and velocity at its end (m/s) of a robot that goes from `velocity` straight
+    to `wanted` at `acceleration` (m/s^2)."""
+    lacking_x, lacking_y = wanted[0] - velocity[0], wanted[1] - velocity[1]
+    gained, lacking = acceleration * period, length(lacking_x, lacking_y)
+    end = jnp.where(lacking > gained, gained / jnp.where(lacking > gained, lacking, 1.0), 1.0)
+    # The time that it takes, at most the whole period, is spent half-way between, the rest at the end.
+    mean = end * (1.0 - 0.5 * jnp.minimum(lacking / gained, 1.0))
+    return (
+        stack(velocity[0] + mean * lacking_x, velocity[1] + mean * lacking_y),
+        stack(velocity[0] + end * lacking_x, velocity[1] + end * lacking_y),
+    )
+
+
+def moved(
+    scenario: Scenario,
+    world: World,
+    velocity: Float[Array, "2 *lanes"],
+    wheels: Float[Array, "m 2 *lanes"],
+    acceleration: Scalar | None,
+) -> World:
+    """`scenario.moved` of a robot that drives `velocity` at once, or else as its `acceleration` (m/s^2) lets
+    it get there from `world.evader_velocity`."""
+    if acceleration is None:
+        return scenario.moved(world, velocity, wheels)
+    mean, end = ramp(world.evader_velocity, velocity, acceleration, scenario.control_period)
+    return eqx.tree_at(lambda w: w.evader_velocity, scenario.moved(world, mean, wheels), end)
+
+
 class Outlook(eqx.Module):
     """What becomes of imagined chases: time (s) until the first contact, all of it where there is none, and
     the smallest clearance (m) on the way, that of the start left out."""
@@ -90,12 +124,14 @@ def imagine(
     ages: Float[Array, "n"],
     length: Scalar,
     steps: int,
+    acceleration: Scalar | None = None,
 ) -> Outlook:
     """What becomes of ways out when they are followed for `steps` of the scenario's control periods.
 
     **Arguments:** `guard(world, wish, sides) -> (action, sides)`, the rows; `worlds` and `sides` with axes
     (models, n) behind their own, model i driving the pursuers of `worlds[..., i, :]`; `ways` the way out
-    followed in each, `ages` how long (s) it has been followed already, `length` of its stretches (s).
+    followed in each, `ages` how long (s) it has been followed already, `length` of its stretches (s);
+    `acceleration` (m/s^2) of the evader's motors, None: they follow at once.
     """
     key = jax.random.key(0)  # the models do not draw
     lanes = (len(models), len(ways))
@@ -111,7 +147,7 @@ def imagine(
         wheels = jnp.stack(
             [pursue(scenario, model, world, key) for model, world in zip(models, each, strict=True)], axis=-2
         )
-        worlds = scenario.moved(worlds, actions, wheels)
+        worlds = moved(scenario, worlds, actions, wheels, acceleration)
         least = jnp.minimum(outlook.least, clearance(scenario, worlds))
         time = outlook.time + jnp.where(least > 0.0, period, 0.0)
         return (worlds, sides, ages + period, Outlook(time, least)), None

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from sidestep.pursuit import make_pursuer, pursue
 from sidestep.safety.joint import JointShield
-from sidestep.safety.look_ahead import stretch, wish
+from sidestep.safety.look_ahead import moved, stretch, wish
 from sidestep.world.state import World
 
 _PLAN_POINTS = 33
@@ -28,8 +28,9 @@ def way_out(shield: JointShield, world: World, memory: Any) -> Float[Array, "n 2
         age = memory.age + period * count
         wished = wish(paced, world, sides, stretch(memory.way, age, shield.horizon / len(memory.way)))
         action, sides = game.heed(world, wished, sides)
-        moved = paced.moved(world, action, pursue(paced, pursuer, world, jax.random.key(0)))
-        return (moved, sides), moved.evader
+        wheels = pursue(paced, pursuer, world, jax.random.key(0))
+        world = moved(paced, world, action, wheels, shield.acceleration)
+        return (world, sides), world.evader
 
     _, way = jax.lax.scan(step, (world, memory.sides), jnp.arange(steps).astype(period.dtype))
     return jnp.concatenate([world.evader[None], way])

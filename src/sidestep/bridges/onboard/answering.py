@@ -28,6 +28,7 @@ class Seen(NamedTuple):
     pursuers: Float[np.ndarray, "m 3"]
     obstacles: Float[np.ndarray, "k 4"]
     target: Numbers
+    velocity: Numbers
     wheel_speeds: Float[np.ndarray, "m 2"]
     time: float
 
@@ -39,6 +40,7 @@ class Seen(NamedTuple):
             self.obstacles,
             self.target,
             np.float64(self.time),
+            evader_velocity=self.velocity,
             wheel_speeds=self.wheel_speeds,
         )
 
@@ -79,16 +81,16 @@ class Answering:
         scenario = shield.scenario
         self._arrays, fixed = eqx.partition((shield, policy), eqx.is_array)
         m, k = scenario.pursuer_count, scenario.obstacle_count
-        self._shapes: list[tuple[int, ...]] = [(2,), (m, 3), (k, 4), (2,), (m, 2), (), (2,), (), (), ()]
+        self._shapes: list[tuple[int, ...]] = [(2,), (m, 3), (k, 4), (2,), (2,), (m, 2), (), (2,), (), (), ()]
         self._count = m + k
 
         @jax.jit
         def answer(arrays: Any, numbers: Array, memory: Any) -> tuple[Array, Any]:
             shield, policy = eqx.combine(arrays, fixed)
             parts = self._split(numbers)
-            evader, pursuers, obstacles, target, wheels, time = parts[:6]
-            world = World(evader, pursuers, obstacles, target, time, wheel_speeds=wheels)
-            wished, ask, flee, delay = parts[6:]
+            evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
+            world = World(evader, pursuers, obstacles, target, time, velocity, wheels)
+            wished, ask, flee, delay = parts[7:]
             outcome, memory = _answer(shield, policy, world, wished, ask, flee, delay, memory)
             return jnp.concatenate([jnp.atleast_1d(part) for part in outcome]), memory
 

@@ -6,6 +6,7 @@ at which they were true, ask it once per control period, and drive what it answe
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections import Counter
@@ -73,6 +74,10 @@ class Onboard:
         if isinstance(shield, str):
             budget = settings.budget if shield in BUDGETED else None
             shield = make_shield(shield, scenario, budget)
+            # Motors that turn the robot round within a period are as good as none.
+            gained = settings.motor_acceleration * float(scenario.control_period)
+            if isinstance(shield, JointShield) and gained < 2.0 * float(scenario.evader_speed):
+                shield = dataclasses.replace(shield, acceleration=settings.motor_acceleration)
         self._shield = shield
         self._init = eqx.filter_jit(shield.init)
         if isinstance(policy, (str, Path)) and policy != GOAL_SEEKING:
@@ -182,7 +187,8 @@ class Onboard:
         begun = time.perf_counter()
         m, k = self.scenario.pursuer_count, self.scenario.obstacle_count
         place = np.zeros(2)
-        seen = Seen(place, np.full((m, 3), 1.0), np.full((k, 4), 2.0), place + 1.0, np.zeros((m, 2)), 0.0)
+        still = place, np.zeros((m, 2)), 0.0
+        seen = Seen(place, np.full((m, 3), 1.0), np.full((k, 4), 2.0), place + 1.0, *still)
         memory = self._init(seen.world())
         self._whole(seen, place, True, False, 0.0, memory)
         if self._rows is not None:
@@ -356,6 +362,7 @@ class Onboard:
             pursuers=np.array(pursuers).reshape(-1, 3),
             obstacles=np.array(obstacles).reshape(-1, 4),
             target=self._target,
+            velocity=self._evader.velocity_at(acts),
             wheel_speeds=np.array(wheels).reshape(-1, 2),
             time=self._decided * self._period,
         )

@@ -15,16 +15,17 @@ ON_FAULT = ("evade", "stop")
 class OnboardSettings:
     """How the decision core takes its input and answers faults.
 
-    **Errors.** `budget` bounds what the rows must allow for. `position_noise` (m) and `heading_noise` (rad)
-    are standard deviations of the poses, for the filters that average them. `actuation_delay` (s) is the part
-    of the delay that passes between a decision and the motors. They then go to the velocity told with the
-    time constant `motor_lag` (s), and no faster than `motor_acceleration` (m/s^2). The own motion is
-    predicted with these; a command is taken to act `actuation_delay + motor_lag` late, and a pursuer's pose
-    is paid for by its age and that, or by `budget.delay` if that is more. `predict_pursuer`: drive the
-    pursuer on to then, at the speeds that it seems to have, and pay for `budget.delay` and what a pose is
-    older than a period. What is guaranteed holds without (an old pose is the same game); with it, a pursuer
-    that drives steadily is met better and one that turns round within the delay worse. An obstacle's drift is
-    taken to wander by `obstacle_acceleration` (m/s per root second).
+    **Errors.** `budget` bounds what the rows must allow for. `position_noise` (m) and `heading_noise`
+    (rad) are standard deviations of the poses, for the filters that average them. `actuation_delay` (s)
+    is the part of the delay that passes between a decision and the motors. They then go to the velocity
+    told with the time constant `motor_lag` (s), and no faster than `motor_acceleration` (m/s^2). The own
+    motion is predicted with these, and `joint` looks ahead with that acceleration; a command is taken to
+    act `actuation_delay + motor_lag` late, and a pursuer's pose is paid for by its age and that, or by
+    `budget.delay` if that is more. `predict_pursuer`: drive the pursuer on to then, at the speeds that it
+    seems to have, and pay for `budget.delay` and what a pose is older than a period. What is guaranteed
+    holds without (an old pose is the same game); with it, a pursuer that drives steadily is met better
+    and one that turns round within the delay worse. An obstacle's drift is taken to wander by
+    `obstacle_acceleration` (m/s per root second).
 
     **Faults.** A robot's pose older than `stale_after` (s), or a decision core that was called late
     `late_limit` times running (later than `late_after` periods), is a fault. `on_fault` says what is left.

@@ -133,6 +133,10 @@ class EvaderTrack(Track):
         moved[:2] += self._driven(self.stamp, time)[0]
         return moved
 
+    def velocity_at(self, time: float) -> Float[np.ndarray, "2"]:
+        """How fast (m/s) it drives at a time (s) at or after `stamp`."""
+        return np.full(2, np.nan) if self.stamp is None else self._driven(self.stamp, time)[1]
+
 
 @final
 class PursuerTrack(Track):
