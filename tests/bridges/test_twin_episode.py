@@ -212,6 +212,8 @@ def test_the_command_counts_draws_and_writes(tmp_path, capsys):
         (["--sensors", "sonar"], "motion-capture"),
         (["--noise", "position_nose=1"], "position_noise"),
         (["--speed", "0"], "speed = 0"),
+        (["--width", "641"], "width = 641"),
+        (["--video", "twin.avi"], "must end in one of .mp4, .gif, .webp"),
     ],
 )
 def test_the_command_names_what_cannot_be(arguments, message, capsys):

@@ -25,6 +25,7 @@ from sidestep.commands.physics import (
     outcome_counts,
     play_seeds,
     setting,
+    video_options,
 )
 
 if TYPE_CHECKING:
@@ -85,11 +86,6 @@ def run(command: Fly, console: Console) -> int:
     from sidestep.bridges.twin import changed_sensors
 
     check_amounts(command)
-    if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:
-        raise ValueError(
-            f"rate = {command.rate}, width = {command.width}: the rate must be at least 1, the width an even "
-            "number from 64 to 1920"
-        )
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     options = FlightOptions(
         sensors=changed_sensors(ROOM_SENSORS, parse_overrides(command.noise)),
@@ -127,8 +123,7 @@ def run(command: Fly, console: Console) -> int:
             about_of(command, "sidestep fly"), console, twin_words="quadrotor in MuJoCo", near=_NEAR,
         )  # fmt: skip
     if command.video is not None:
-        size = (round(command.width * 9 / 32) * 2, command.width)
-        path = write_video(played.first, command.video, speed=command.speed, rate=command.rate, size=size)
+        path = write_video(played.first, command.video, **video_options(command))
         console.print(f"Video: {path}", soft_wrap=True)
     return 0
 

@@ -29,11 +29,26 @@ class Played:
 
 
 def check_amounts(command: Twin | Fly) -> None:
-    """**Raises** `ValueError` for a number of seeds or a speed of the video that there cannot be."""
+    """**Raises** `ValueError` for a number of seeds or a video that there cannot be."""
     if command.seeds < 1:
         raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
     if not command.speed > 0.0:
         raise ValueError(f"speed = {command.speed}: it must be greater than 0")
+    if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:
+        raise ValueError(
+            f"rate = {command.rate}, width = {command.width}: the rate must be at least 1, the width an even "
+            "number from 64 to 1920"
+        )
+    if command.video is not None:
+        from sidestep.views.video_files import check_video
+
+        check_video(command.video)
+
+
+def video_options(command: Twin | Fly) -> dict[str, Any]:
+    """Speed, rate and size of the video, as `write_video` takes them."""
+    size = (round(command.width * 9 / 32) * 2, command.width)
+    return {"speed": command.speed, "rate": command.rate, "size": size}
 
 
 def play_seeds(

@@ -25,6 +25,7 @@ from sidestep.commands.physics import (
     outcome_counts,
     play_seeds,
     setting,
+    video_options,
 )
 
 if TYPE_CHECKING:
@@ -70,9 +71,13 @@ class Twin:
     out: Path | None = None
     """Folder for the figure of the first episode beside the plain simulation, and its recording."""
     video: Path | None = None
-    """Also render the first episode into this MP4 file."""
+    """Also render the first episode into this .mp4, .gif or .webp file."""
     speed: float = 2.0
     """How many times faster the video runs."""
+    rate: int = 25
+    """Pictures per second of the video."""
+    width: int = 960
+    """Width of the video in pixels; 16 by 9."""
     log: Path | None = None
     """Also write the first episode as an MCAP log of ROS 2 messages; never over a file that exists."""
     json: Path | None = None
@@ -143,6 +148,6 @@ def run(command: Twin, console: Console) -> int:
             twin_words=f"physics twin, {command.base}, {command.sensors}",
         )  # fmt: skip
     if command.video is not None:
-        path = write_video(first, command.video, speed=command.speed)
+        path = write_video(first, command.video, **video_options(command))
         console.print(f"Video: {path}", soft_wrap=True)
     return 0

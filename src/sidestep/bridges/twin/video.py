@@ -70,12 +70,14 @@ def write_video(
     speed: float = 1.0,
     size: tuple[int, int] = _SIZE,
 ) -> Path:
-    """Write an episode as an MP4 video (H.264) of `rate` frames per second, `speed` times as fast as it was.
+    """Write an episode as a video of `rate` frames per second, `speed` times as fast as it was: .mp4 (H.264),
+    .gif or .webp.
 
-    It ends with one second of the last frame. **Raises** `TwinError` when PyAV or off-screen rendering is
-    missing, and as `write_video_file`.
+    It ends with one second of the last frame. **Raises** `TwinError` when off-screen rendering, or for .mp4
+    PyAV, is missing, and as `write_video_file`.
     """
-    load_av()
+    if Path(path).suffix.lower() == ".mp4":
+        load_av()
     times = np.arange(0.0, episode.frame_times[-1], speed / rate)
     frames = frames_of(episode, np.append(times, episode.frame_times[-1]), size)
     return write_video_file(path, frames, rate, hold=1.0)
