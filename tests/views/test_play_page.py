@@ -209,3 +209,49 @@ def test_the_colours_follow_the_computer(page, request):
     paper = page.evaluate("getComputedStyle(document.body).color").removeprefix("rgb(").split(",")
     light_text = int(paper[0]) > 128
     assert light_text == (request.node.callspec.params["page"]["color_scheme"] == "dark")
+
+
+def test_pictures_rest_where_inputs_come_late_to_the_screen_and_not_for_ever(page):
+    rests = page.evaluate(
+        """async () => {
+          const { Pictures } = await import("/static/pictures.js");
+          const real = performance.now.bind(performance);
+          let ahead = 0;
+          performance.now = () => real() + ahead;
+          const pictures = new Pictures(() => {});
+          let rests = 0;
+          const rest = pictures.rest.bind(pictures);
+          pictures.rest = (now) => { rests += 1; rest(now); };
+          const felt = (duration, times) => { for (let i = 0; i < times; i++) pictures.felt(duration); return rests; };
+          const told = [felt(24, 50), felt(48, 4), felt(24, 1), felt(48, 4), felt(48, 1)];
+          told.push(felt(48, 50)); // too soon after the last
+          for (let i = 0; i < 9; i++) { ahead += 5000; felt(48, 5); }
+          told.push(rests); // in vain: the computer is slow
+          felt(24, 1);
+          ahead += 5000;
+          told.push(felt(48, 5)); // it was not always
+          performance.now = real;
+          return told;
+        }"""
+    )
+    assert rests == [0, 0, 0, 0, 1, 1, 3, 4]
+
+
+def test_after_a_rest_pictures_go_on(page):
+    during, after = page.evaluate(
+        """async () => {
+          const { Pictures } = await import("/static/pictures.js");
+          const times = [];
+          const pictures = new Pictures((now) => times.push(now));
+          const drawn = async (count) => {
+            while (times.length < count) await new Promise((done) => setTimeout(done, 5));
+          };
+          await drawn(5);
+          const before = times.length;
+          pictures.rest();
+          await drawn(before + 20);
+          return [Math.max(...times.slice(before).map((now, i) => now - times[before + i - 1])), times.length];
+        }"""
+    )
+    assert during >= 60.0
+    assert after >= 20

@@ -6,6 +6,7 @@ import { Input, isTaken } from "./input.js";
 import { fromLink, toLink } from "./link.js";
 import { Motion } from "./motion.js";
 import { Panel } from "./panel.js";
+import { Pictures } from "./pictures.js";
 import { Scene } from "./scene.js";
 import { readColours } from "./theme.js";
 
@@ -42,6 +43,7 @@ const connection = new Connection({
     document.body.dataset.connected = "yes";
   },
   setup(message) {
+    if (message.ready && !state.setup?.ready) pictures.rest();
     state.setup = message;
     state.restore = null;
     panel.take(message);
@@ -147,7 +149,6 @@ function freeRoom() {
 }
 
 function draw(now) {
-  requestAnimationFrame(draw);
   if (bannerUntil && now > bannerUntil) {
     bannerUntil = 0;
     byId("banner").hidden = true;
@@ -329,4 +330,4 @@ addEventListener("hashchange", () => {
   const link = state.hello && fromLink(location.hash, state.hello);
   if (link) connection.send(link);
 });
-requestAnimationFrame(draw);
+const pictures = new Pictures(draw);
