@@ -222,7 +222,10 @@ def test_pictures_rest_where_inputs_come_late_to_the_screen_and_not_for_ever(pag
           let rests = 0;
           const rest = pictures.rest.bind(pictures);
           pictures.rest = (now) => { rests += 1; rest(now); };
-          const felt = (duration, times) => { for (let i = 0; i < times; i++) pictures.felt(duration); return rests; };
+          const felt = (duration, times) => {
+            for (let i = 0; i < times; i++) pictures.felt(duration);
+            return rests;
+          };
           const told = [felt(24, 50), felt(48, 4), felt(24, 1), felt(48, 4), felt(48, 1)];
           told.push(felt(48, 50)); // too soon after the last
           for (let i = 0; i < 9; i++) { ahead += 5000; felt(48, 5); }
@@ -250,7 +253,8 @@ def test_after_a_rest_pictures_go_on(page):
           const before = times.length;
           pictures.rest();
           await drawn(before + 20);
-          return [Math.max(...times.slice(before).map((now, i) => now - times[before + i - 1])), times.length];
+          const gaps = times.slice(before).map((now, i) => now - times[before + i - 1]);
+          return [Math.max(...gaps), times.length];
         }"""
     )
     assert during >= 60.0
