@@ -12,10 +12,10 @@ from PIL import Image, ImageSequence
 from sidestep.cli import main
 from sidestep.trials import save_trajectory
 from sidestep.views import VideoError, animate
-from sidestep.views.animation import Stage
 from sidestep.views.motion import Motion, nearest_pursuers
 from sidestep.views.outlines import LevelOutlines
 from sidestep.views.scene import _composed_barrier
+from sidestep.views.stage import Stage
 from sidestep.views.style import EVADER
 from sidestep.views.video_files import write_video_file
 from sidestep.world import Scenario, World

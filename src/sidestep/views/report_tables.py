@@ -1,0 +1,103 @@
+"""The numbers of a report: a card for each shield, and the paper's figures beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sidestep.learning.records import converged_episode
+from sidestep.trials import Trajectory
+from sidestep.views.html import shown_number
+from sidestep.views.runs import Run
+from sidestep.views.style import OUTCOME_WORDS, shield_words
+from sidestep.views.training_figures import PAPER_CONVERGED, safety_rows
+
+
+def percent(value: float | int | None, digits: int = 1) -> str:
+    """A share in percent; a dash where there is none."""
+    return "–" if value is None else f"{100 * value:.{digits}f}\u00a0%"
+
+
+def convergence(group: Sequence[Run]) -> str:
+    """Where a shield's runs converged, in words."""
+    episodes = [converged_episode([float(e["return"]) for e in run.metrics]) for run in group]
+    found = sorted(episode for episode in episodes if episode is not None)
+    if len(group) == 1:
+        return f"episode {found[0]}" if found else "never"
+    return f"{len(found)} of {len(group)} seeds" + (f", at {', '.join(map(str, found))}" if found else "")
+
+
+def card(shield: str, group: Sequence[Run], scenes: Mapping[str, tuple[Run, Trajectory]]) -> dict[str, Any]:
+    """How safe the training behind one shield was, where it converged and how its test scene ended."""
+    row = next(row for row in safety_rows(group) if row["shield"] == shield)
+    scene = scenes.get(shield)
+    return {
+        "shield": shield,
+        "safe": row["safe"],
+        "episodes": row["episodes"],
+        "captured": row["captured"],
+        "collided": row["collided"],
+        "converged": convergence(group),
+        "scene": OUTCOME_WORDS[scene[1].outcome] if scene else None,
+    }
+
+
+def _pooled(group: Sequence[Run], key: str) -> list[float]:
+    return [float(episode[key]) for run in group for episode in run.metrics if episode.get(key) is not None]
+
+
+def comparison(
+    groups: Mapping[str, Sequence[Run]],
+    scenes: Mapping[str, Trajectory],
+    untrained_scenes: Mapping[str, Trajectory],
+) -> dict[str, Any]:
+    """The paper's figures beside ours: names of the columns, and rows of cells."""
+    safety = {row["shield"]: row for row in safety_rows([run for group in groups.values() for run in group])}
+    paper = safety.pop(None)
+    rows: list[tuple[str, list[str]]] = [
+        ("training episodes", [str(paper["episodes"]), *(str(row["episodes"]) for row in safety.values())]),
+        ("safe episodes", [str(paper["safe"]), *(str(row["safe"]) for row in safety.values())]),
+        *((name, ["0", *(str(row[name]) for row in safety.values())]) for name in ("captured", "collided")),
+        ("safety ratio", [percent(row["ratio"]) for row in (paper, *safety.values())]),
+        (
+            "its 95 % bounds",
+            [f"{percent(row['low'])[:-2]} to {percent(row['high'])}" for row in (paper, *safety.values())],
+        ),
+        ("converged", [f"within {PAPER_CONVERGED} episodes", *(convergence(g) for g in groups.values())]),
+    ]
+
+    def add(name: str, reported: str, cells: Sequence[str]) -> None:
+        rows.append((name, [reported, *cells]))
+
+    finals = [
+        np.mean([r for run in g for r in _pooled([run], "return")[-20:]] or [np.nan]) for g in groups.values()
+    ]
+    add(
+        "mean return of the last 20",
+        "1000",
+        [shown_number(None if np.isnan(f) else float(f), 0) for f in finals],
+    )
+    steps = [sum(_pooled(group, "steps")) for group in groups.values()]
+    for key, name in (("interventions", "periods corrected"), ("infeasible", "periods infeasible")):
+        shares = [
+            sum(_pooled(g, key)) / s if s else None for g, s in zip(groups.values(), steps, strict=True)
+        ]
+        add(name, "–", [percent(share) for share in shares])
+    corrections = [
+        sum(float(e["mean_correction"]) * int(e["steps"]) for run in group for e in run.metrics) / periods
+        if periods
+        else None
+        for group, periods in zip(groups.values(), steps, strict=True)
+    ]
+    add("mean correction", "–", [shown_number(value, 4, " m/s") for value in corrections])
+    closest = [min(_pooled(group, "min_pursuer_clearance"), default=None) for group in groups.values()]
+    add("closest to capture", "–", [shown_number(value, 4, " m") for value in closest])
+    for policy, found, reported in (
+        ("learned policy", scenes, "reached the target"),
+        ("straight for the target", untrained_scenes, "–"),
+    ):
+        ends = [OUTCOME_WORDS[found[shield].outcome] if shield in found else "not run" for shield in groups]
+        add(f"test scene, {policy}", reported, ends)
+    return {"columns": ["the paper reports", *(shield_words(shield) for shield in groups)], "rows": rows}
