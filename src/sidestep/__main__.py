@@ -1,7 +1,17 @@
-"""`python -m sidestep`: the command line."""
+"""Entry point of the program, for `sidestep` and `python -m sidestep`."""
 
 import sys
 
-from sidestep.cli import main
+from sidestep import _interrupts
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command line; returns the exit status. Ctrl-C counts from here on, while imports run too."""
+    _interrupts.claim()
+    from sidestep import cli
+
+    return cli.main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sidestep import _interrupts
 from sidestep.commands.common import CountBar
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def video_options(command: Twin | Fly) -> dict[str, Any]:
     return {"speed": command.speed, "rate": command.rate, "size": size}
 
 
+@_interrupts.held()
 def play_seeds(
     command: Twin | Fly,
     robots: str,
@@ -76,6 +78,7 @@ def play_seeds(
         player = prepare()
         try:
             for number in range(command.seeds):
+                _interrupts.check()
                 episode = play(player, command.seed + number)
                 first = first or episode
                 figures.append(episode.to_dict())

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sidestep
+from sidestep import _interrupts
 from sidestep.learning import records
 from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
@@ -106,6 +107,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
     }
 
 
+@_interrupts.held()
 def train(
     scenario: Scenario,
     *,
@@ -178,6 +180,7 @@ def train(
 
     try:
         while int(state.episodes) < episodes:
+            _interrupts.check()
             chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
             reached, report = run_chunk(scenario, guard, hunter, options, state, limit, chunk)
             lines = _episode_lines(report, len(metrics))

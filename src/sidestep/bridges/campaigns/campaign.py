@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sidestep import _interrupts
 from sidestep.bridges.campaigns.cluster import LOCAL, check_options, connected, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
 from sidestep.bridges.packages import needed
@@ -71,6 +72,7 @@ def _quiet(done: int, jobs: int, note: str) -> None:
     pass
 
 
+@_interrupts.held()
 def run_campaign(
     campaign: Campaign,
     folder: str | Path,
@@ -189,6 +191,7 @@ class _Dispatch:
         """Every job to its end. **Raises** `SchedulerLostError`."""
         self.waiting = _Waiting(jobs)
         while self.waiting or self.at_work:
+            _interrupts.check()
             alive = self.workers()
             for future, (job, address) in list(self.at_work.items()):
                 if address not in alive:

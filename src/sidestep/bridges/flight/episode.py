@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sidestep import _interrupts
 from sidestep.bridges.flight.flight import Flight
 from sidestep.bridges.flight.options import FlightOptions, budget_of, check_scenario, errors_of
 from sidestep.bridges.onboard import Onboard, OnboardSettings
@@ -192,6 +193,7 @@ def fly(
     period = float(scenario.control_period)
     log = Log(truth)
     for count in range(limit):
+        _interrupts.check()
         now = flight.time
         decision = pilot.decide(flight)
         estimate = pilot.onboard.world(now) if options.pursuer_sees == "measurements" else None

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sidestep import _interrupts
 from sidestep.bridges.onboard import Onboard, OnboardSettings
 from sidestep.bridges.twin.options import TwinOptions
 from sidestep.bridges.twin.record import (
@@ -120,6 +121,7 @@ def twin_episode(
     period = float(scenario.control_period)
     log = Log(truth)
     for count in range(limit):
+        _interrupts.check()
         now = twin.time
         for robot, index, stamp, pose in twin.measurements():
             onboard.see(robot, stamp, pose if robot != "obstacle" else pose[:2], index)

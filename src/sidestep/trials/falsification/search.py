@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 import sidestep
+from sidestep import _interrupts
 from sidestep.learning.checkpoints import read_arrays, write_arrays
 from sidestep.learning.policy import load_policy
 from sidestep.learning.records import (
@@ -209,12 +210,14 @@ class _Hunt:
             state, _ = read_arrays(self._state_file(name), state)
         return state
 
+    @_interrupts.held()
     def run(self, minutes: float | None, episodes: int | None) -> Falsification:
         """Rounds until the time is over or every attack has played its episodes."""
         budget = None if minutes is None else self.before + 60.0 * minutes
         interrupted = False
         try:
             while budget is None or self.elapsed < budget:
+                _interrupts.check()
                 waiting = [
                     name for name in self.plan.attacks
                     if episodes is None or self.tallies[name].episodes < episodes
