@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import abc
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
+
+from sidestep._program import command as command_line
+from sidestep.store.files import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,12 +69,28 @@ def scenario_of_run(
     return load_scenario(scenario or "paper", **changes), config
 
 
+@contextmanager
+def going_on(folder: Path, *words: object) -> Iterator[None]:
+    """Adds to the error of what cannot be written into `folder` any more the command to go on with."""
+    try:
+        yield
+    except OutputError as error:
+        raise advised(error, folder, *words) from error.__cause__
+
+
+def advised(error: OutputError, folder: Path, *words: object) -> OutputError:
+    """The error with the command to go on with, if anything was begun in `folder`."""
+    if not any((folder / name).is_file() for name in ("config.json", "campaign.json")):
+        return error
+    first = "With more room there" if error.full else "When that is mended"
+    return error.and_kept(f"{first}, go on with: {command_line(*words)}")
+
+
 def write_json_file(path: Path | None, data: Any) -> None:
     """Write `data` to `path`, if there is one; folders on the way to it are made."""
     if path is not None:
-        from sidestep.learning.records import write_json
+        from sidestep.store.files import write_json
 
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, data)
 
 

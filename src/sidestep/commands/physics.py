@@ -29,7 +29,7 @@ class Played:
 
 
 def check_amounts(command: Twin | Fly) -> None:
-    """**Raises** `ValueError` for a number of seeds or a video that there cannot be."""
+    """**Raises** `ValueError` for a number of seeds, or an output, that there cannot be."""
     if command.seeds < 1:
         raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
     if not command.speed > 0.0:
@@ -43,6 +43,10 @@ def check_amounts(command: Twin | Fly) -> None:
         from sidestep.views.video_files import check_video
 
         check_video(command.video)
+    from sidestep.store.outputs import try_outputs
+
+    log = getattr(command, "log", None)
+    try_outputs(files=[command.json, command.video], new=[log], folders=[command.out])
 
 
 def video_options(command: Twin | Fly) -> dict[str, Any]:
@@ -122,7 +126,6 @@ def draw_beside_simulation(
 
     scenario = episode.scenario
     simulation = rollout(scenario, policy, shield, command.pursuer, episode.seed, steps=command.steps)
-    stem.parent.mkdir(parents=True, exist_ok=True)
     save_trajectory(stem.with_suffix(".npz"), episode.trajectory, scenario, about)
     png, pdf = twin_figure(scenario, simulation, episode.trajectory, stem, shield=command.shield, **looks)
     console.print(f"Figure: {png} and {pdf}", soft_wrap=True)

@@ -14,6 +14,7 @@ import sidestep
 from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import SHIELDS, Status, make_shield
+from sidestep.store.files import json_safe, read_json, write_json
 from sidestep.trials.captures import examine_captures
 from sidestep.trials.keys import evaluation_seed
 from sidestep.trials.monte_carlo import evaluate
@@ -65,7 +66,7 @@ class ShieldStudy:
 def describe(trajectory: Trajectory) -> dict[str, Any]:
     """A recorded episode in a few figures: outcome, time (s), clearances (m), corrections (m/s)."""
     events, status = trajectory.events, np.asarray(trajectory.status)
-    return records.json_safe(
+    return json_safe(
         {
             "outcome": trajectory.outcome,
             # The clock of a long episode has gathered rounding; its first tick has not.
@@ -98,8 +99,8 @@ def _quiet(label: str) -> AbstractContextManager[Callable[..., None]]:
 
 def _measured(path: Path, run: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     if not path.exists():
-        records.write_json(path, run())
-    return records.read_json(path)
+        write_json(path, run())
+    return read_json(path)
 
 
 def _recorded(path: Path, run: Callable[[], Trajectory]) -> Trajectory:
@@ -151,7 +152,7 @@ def reproduce(
         "version": sidestep.__version__,
     }
     if resume and (out / "config.json").exists():
-        if records.open_run(out) != records.json_safe(config):
+        if records.open_run(out) != json_safe(config):
             raise records.RunError(f"{out} was begun with other settings; use the same, or another --out")
     else:
         records.create_run(out, config)

@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
-from sidestep.learning.records import OUTCOMES, json_safe, write_bytes
+from sidestep.learning.records import OUTCOMES
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, as_shield
+from sidestep.store.files import json_safe, write_bytes
 from sidestep.trials.keys import as_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
 from sidestep.world import Events, Scenario, World, load_scenario, scenario_to_dict

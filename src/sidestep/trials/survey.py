@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from sidestep.learning import load_policy
-from sidestep.learning.records import OUTCOMES, RunError, open_run, read_json, write_bytes
+from sidestep.learning.records import OUTCOMES, RunError, open_run
+from sidestep.store.files import read_json, write_bytes
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.keys import episode_key, evaluation_seed
@@ -136,8 +137,6 @@ def save_survey(folder: str | Path, survey: Survey) -> None:
     """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all."""
     folder = Path(folder)
     scenario, about = _told(folder)
-    if survey.worst:
-        (folder / WORST_FOLDER).mkdir(exist_ok=True)
     for episode in survey.worst:
         save_trajectory(_worst_path(folder, episode.number), episode.trajectory, scenario, about)
     arrays: dict[str, Any] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,12 @@ from sidestep.learning.records import (
     RunError,
     append_metrics,
     create_run,
-    json_safe,
     open_run,
     read_metrics,
     write_summary,
 )
 from sidestep.safety import Shield, as_shield
+from sidestep.store.files import OutputError, json_safe, make_folder
 from sidestep.trials.falsification.attacks import ATTACKS, Round, make_attack
 from sidestep.trials.falsification.chases import GOALS, Target
 from sidestep.trials.falsification.counterexamples import (
@@ -133,7 +134,7 @@ def falsify(
         _check_policy(folder, about["policy"])
     else:
         create_run(folder, about)
-    (folder / "counterexamples").mkdir(exist_ok=True)
+    make_folder(folder / "counterexamples")
     hunt = _Hunt(folder, target, shield_called, about, plan, progress)
     return hunt.run(minutes, episodes)
 
@@ -227,9 +228,21 @@ class _Hunt:
                     self.progress(Progress(name, self.tallies[name], self.tallies, self.elapsed, budget))
         except KeyboardInterrupt:
             interrupted = True
+        except OutputError as error:
+            with suppress(OutputError):
+                write_summary(self.folder, self._summary(True))
+            raise error.and_kept(self._kept()) from error.__cause__
         summary = self._summary(interrupted)
-        write_summary(self.folder, summary)
+        try:
+            write_summary(self.folder, summary)
+        except OutputError as error:
+            raise error.and_kept(self._kept()) from error.__cause__
         return Falsification(self.folder, summary, self.tallies, interrupted)
+
+    def _kept(self) -> str:
+        rounds = sum(tally.rounds for tally in self.tallies.values())
+        found = sum(len(tally.kept) for tally in self.tallies.values())
+        return f"Kept: {rounds} rounds of the search and {found} counterexamples in {self.folder}"
 
     def _round(self, name: str) -> None:
         began, tally = time.perf_counter(), self.tallies[name]
