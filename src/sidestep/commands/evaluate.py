@@ -51,12 +51,15 @@ class Evaluate:
 
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
+    from sidestep._arrays import seed_number, whole_number
     from sidestep.store.outputs import try_outputs
     from sidestep.trials import episode_key, rollout
     from sidestep.trials import evaluate as run_evaluation
 
     check_options(command.film)
     try_outputs(files=[command.json], new=[command.log, command.film.video])
+    whole_number("episodes", command.episodes), whole_number("batch", command.batch)
+    seed_number(command.seed)
     policy, scenario, config = policy_and_scenario(command.run, command.scenario, command.set)
     if not 0 <= command.log_episode < command.episodes:
         raise ValueError(

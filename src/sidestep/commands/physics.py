@@ -30,8 +30,12 @@ class Played:
 
 def check_amounts(command: Twin | Fly) -> None:
     """**Raises** `ValueError` for a number of seeds, or an output, that there cannot be."""
-    if command.seeds < 1:
-        raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
+    from sidestep._arrays import seed_number, whole_number
+
+    seed_number(command.seed)
+    whole_number("seeds", command.seeds, most=2**32 - command.seed)
+    if command.steps is not None:
+        whole_number("steps", command.steps)
     if not command.speed > 0.0:
         raise ValueError(f"speed = {command.speed}: it must be greater than 0")
     if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:

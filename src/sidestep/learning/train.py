@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sidestep
+from sidestep._arrays import seed_number, whole_number
 from sidestep.learning import records
 from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
@@ -137,12 +138,7 @@ def train(
     not set, or holds nothing to resume, and `OutputError` when the run cannot be written any more: the newest
     checkpoint stays, and the run can be resumed from it.
     """
-    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("chunk", chunk, 1)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
-    if seed >= 2**32:
-        # JAX would drop the upper bits, and two seeds would silently be one.
-        raise ValueError(f"seed = {seed!r}: it must be less than 2^32")
+    whole_number("episodes", episodes), whole_number("chunk", chunk), seed_number(seed)
     options = make_options() if options is None else options
     guard, hunter = as_shield(shield, scenario), as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)

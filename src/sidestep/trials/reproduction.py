@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import sidestep
+from sidestep._arrays import seed_number, whole_number
 from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import SHIELDS, Status, make_shield
@@ -77,6 +78,7 @@ def describe(trajectory: Trajectory) -> dict[str, Any]:
             "intervention_rate": float(np.mean(status != Status.OK)),
             "infeasible_rate": float(np.mean(status == Status.INFEASIBLE)),
             "mean_correction": float(trajectory.intervention.mean()),
+            "pursuer_invalid": trajectory.pursuer_invalid,
         }
     )
 
@@ -134,6 +136,8 @@ def reproduce(
     """
     scenario = load_scenario("paper") if scenario is None else scenario
     options = make_options() if options is None else options
+    seed_number(seed), whole_number("episodes", episodes)
+    whole_number("evaluation_episodes", evaluation_episodes)
     make_pursuer(pursuer)
     for shield in shields:
         make_shield(shield, scenario)

@@ -142,7 +142,7 @@ def save_survey(folder: str | Path, survey: Survey) -> None:
     arrays: dict[str, Any] = {
         entry.name: getattr(survey.evaluation, entry.name)
         for entry in dataclasses.fields(Evaluation)
-        if entry.name != "map"
+        if entry.name != "map" and getattr(survey.evaluation, entry.name) is not None
     }
     if survey.evaluation.map is not None:
         arrays |= {_MAP + name: values for name, values in survey.evaluation.map.to_arrays().items()}

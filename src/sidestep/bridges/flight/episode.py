@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._arrays import seed_number
 from sidestep.bridges.flight.flight import Flight
 from sidestep.bridges.flight.options import FlightOptions, budget_of, check_scenario, errors_of
 from sidestep.bridges.onboard import Onboard, OnboardSettings
@@ -183,6 +184,7 @@ def fly(
     scenario, options = pilot.scenario, pilot.options
     limit = periods_of(scenario, steps)
     strategy = as_pursuer(pursuer)
+    seed_number(seed)
     flight = Flight(scenario, options, seed)
     drawn, key = start_of(scenario, jnp.asarray(seed, jnp.uint32))
     flight.reset(drawn if world is None else world)

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 import sidestep
+from sidestep._arrays import seed_number, whole_number
 from sidestep.learning.checkpoints import read_arrays, write_arrays
 from sidestep.learning.policy import load_policy
 from sidestep.learning.records import (
@@ -66,10 +67,9 @@ def check_plan(scenario: Scenario, plan: Plan) -> None:
         raise ValueError(f"attacks = {list(plan.attacks)}: they must be some of {', '.join(ATTACKS)}")
     if len(set(plan.attacks)) < len(plan.attacks):
         raise ValueError(f"attacks = {list(plan.attacks)}: each may be named only once")
-    for name, least in (("batch", 1), ("most", 1), ("seed", 0)):
-        value = getattr(plan, name)
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
+    for name in ("batch", "most"):
+        whole_number(name, getattr(plan, name))
+    seed_number(plan.seed)
     if not np.isfinite(plan.seconds) or plan.seconds < float(scenario.control_period):
         raise ValueError(f"seconds = {plan.seconds!r}: it must be at least one control period")
 
@@ -109,8 +109,8 @@ def falsify(
         minutes = _DEFAULT_MINUTES
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
         raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
-    if episodes is not None and (isinstance(episodes, bool) or episodes < 1):
-        raise ValueError(f"episodes = {episodes!r}: it must be a whole number of at least 1")
+    if episodes is not None:
+        whole_number("episodes", episodes)
     plan = plan or Plan()
     if resume:
         scenario, source, shield, plan = _stored(folder, policy, shield)
@@ -262,6 +262,7 @@ class _Hunt:
                 "captured": np.sum(result.outcome == OUTCOMES.index("captured")),
                 "collided": np.sum(result.outcome == OUTCOMES.index("collided")),
                 "unconfirmed": unconfirmed,
+                "pursuer_invalid": np.sum(~np.all(np.isfinite(result.wheels), axis=(-2, -1))),
                 **{which: np.min(getattr(result, which)) for which in LEAST},
                 "counterexamples": kept,
                 "seconds": time.perf_counter() - began,
@@ -338,6 +339,7 @@ class _Hunt:
                 "control_periods": sum(tally.control_periods for tally in self.tallies.values()),
                 "captured": sum(tally.captured for tally in self.tallies.values()),
                 "collided": sum(tally.collided for tally in self.tallies.values()),
+                "pursuer_invalid": sum(tally.pursuer_invalid for tally in self.tallies.values()),
                 "first_seconds": found[0]["at"] if found else None,
                 "kept": len(found),
                 "inside_assumptions": sum(name is None for name in assumptions),
