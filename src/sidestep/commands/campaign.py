@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import CampaignBar, going_on, write_json_file
+from sidestep.commands.common import CampaignBar, going_on, stood_still, write_json_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -118,6 +118,9 @@ def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Con
     )
     if outcome.damaged:
         say(f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
+    still = sum(row.get("pursuer_invalid") or 0 for row in outcome.rows)
+    if still:
+        say(f"Warning: {stood_still(still)}")
     used = {row["version_sidestep"] for row in outcome.rows}
     if len(used) > 1:
         say(f"Results come from different versions of sidestep: {', '.join(sorted(used))}")

@@ -51,6 +51,8 @@ def policy_and_scenario(
         return run, *scenario_of_run(None, scenario, overrides)
     from sidestep.learning import load_policy
 
+    if not Path(run).exists():
+        raise ValueError(f"{run} does not exist; name a run folder, a policy.npz or goal-seeking")
     return load_policy(run), *scenario_of_run(run, scenario, overrides)
 
 
@@ -84,6 +86,15 @@ def advised(error: OutputError, folder: Path, *words: object) -> OutputError:
         return error
     first = "With more room there" if error.full else "When that is mended"
     return error.and_kept(f"{first}, go on with: {command_line(*words)}")
+
+
+def stood_still(periods: int, episodes: int | None = None) -> str:
+    """What to say where a pursuer's wheel speeds were not finite, in so many control periods."""
+    where = "" if episodes is None else f" of {episodes} episodes"
+    return (
+        f"the pursuer's wheel speeds were not finite in {periods} control periods{where}, and it stood "
+        "still: what was not captured then is not safe for that"
+    )
 
 
 def write_json_file(path: Path | None, data: Any) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, write_json_file
+from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, stood_still, write_json_file
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
@@ -137,4 +137,6 @@ def evaluation_table(evaluation: Evaluation) -> Any:
         f"shield corrects {figures['intervention_rate']:.1%} of steps, cannot satisfy all rows in "
         f"{figures['infeasible_rate']:.2%}"
     )
+    if figures["pursuer_invalid"]:
+        table.caption += "; " + stood_still(figures["pursuer_invalid"], figures["pursuer_invalid_episodes"])
     return table

@@ -56,6 +56,8 @@ def run(command: Export, console: Console) -> int:
 
     if command.format not in ("onnx", "jax"):
         raise ValueError(f"unknown format '{command.format}'; use onnx or jax")
+    if command.run == "goal-seeking":
+        raise ValueError("goal-seeking is built in and has nothing to export; name the run of a training")
     if command.out.exists() and not command.overwrite and not is_stream(command.out):
         raise ValueError(f"{command.out} exists already; give another file, or --overwrite to replace it")
     try_outputs(files=[command.out, command.json])

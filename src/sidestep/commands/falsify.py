@@ -14,6 +14,7 @@ from sidestep.commands.common import (
     ShieldName,
     going_on,
     parse_overrides,
+    stood_still,
     write_json_file,
 )
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
@@ -197,9 +198,12 @@ def findings(found: Falsification) -> list[str]:
     from sidestep.trials.falsification import ASSUMPTIONS
 
     summary = found.summary
+    lines = []
+    if summary["pursuer_invalid"]:
+        lines.append(f"Warning: {stood_still(summary['pursuer_invalid'])}.")
     if not summary["counterexamples"]:
-        return [f"No counterexample in {summary['episodes']} episodes."]
-    lines = [f"First counterexample after {summary['first_seconds']:.1f} s, compiling included."]
+        return [*lines, f"No counterexample in {summary['episodes']} episodes."]
+    lines += [f"First counterexample after {summary['first_seconds']:.1f} s, compiling included."]
     for name, count in summary["by_assumption"].items():
         if name in ASSUMPTIONS:
             lines.append(f"  {count} broke the assumption that {ASSUMPTIONS[name]}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sidestep.commands.common import CountBar
+from sidestep.commands.common import CountBar, stood_still
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -181,3 +181,6 @@ def episode_table(figures: list[dict[str, Any]], what: str, console: Console) ->
         low, high = counts[f"{name}_rate_low"], counts[f"{name}_rate_high"]
         table.add_row(name.replace("_", " "), str(counts[name]), f"{low:.2%} to {high:.2%}")
     console.print(table)
+    still = sum(figure["pursuer_invalid"] for figure in figures)
+    if still:
+        console.print(f"Warning: {stood_still(still)}.", highlight=False)

@@ -35,6 +35,10 @@ CONVERGENCE_RETURN = 940.0
 _CONFIG, _METRICS, _SUMMARY = "config.json", "metrics.jsonl", "summary.json"
 
 
+NOT_BEGUN = "leave out --resume to start one there"
+"""What to do about a run that is to go on where there is none."""
+
+
 class RunError(ValueError):
     """A run folder that cannot be used as asked; the message says what to do instead."""
 
@@ -75,11 +79,15 @@ def _is_left_by_a_kill(entry: Path) -> bool:
     return entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp"
 
 
-def open_run(folder: str | Path) -> dict[str, Any]:
-    """The configuration of an existing run. **Raises** `RunError` when `folder` holds none."""
+def open_run(folder: str | Path, otherwise: str = "") -> dict[str, Any]:
+    """The configuration of an existing run.
+
+    **Raises** `RunError` when `folder` holds none; `otherwise` says what to do then.
+    """
     folder = Path(folder)
     if not (folder / _CONFIG).is_file():
-        raise RunError(f"{folder} holds no run (no {_CONFIG}); leave out --resume to start one there")
+        what = f"holds no run (no {_CONFIG})" if folder.exists() else "does not exist"
+        raise RunError(f"{folder} {what}" + (f"; {otherwise}" if otherwise else ""))
     for name in ("checkpoints", "figures"):
         make_folder(folder / name)
     return _read(folder / _CONFIG)

@@ -96,7 +96,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
 
     **Raises** `RunError` when `folder` holds no run.
     """
-    config = records.open_run(folder)
+    config = records.open_run(folder, records.NOT_BEGUN)
     fields = dict(config["scenario"])
     # The stored fields are complete, so whichever preset they start from leaves no trace.
     return {
@@ -237,7 +237,7 @@ def _kept(folder: Path) -> str:
 
 def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
     """**Raises** `RunError` naming what differs from the run that `folder` holds."""
-    stored = records.open_run(folder)
+    stored = records.open_run(folder, records.NOT_BEGUN)
     for name in ("scenario", "learner", "shield", "pursuer", "seed"):
         if json_safe(stored.get(name)) != json_safe(config[name]):
             raise records.RunError(

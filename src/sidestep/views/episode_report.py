@@ -80,4 +80,7 @@ def _cards(trajectory: Trajectory) -> list[tuple[str, str, str]]:
     cards.append(("Largest correction", shown_number(float(np.max(changed)), 3), "m/s"))
     lost = 100.0 * float(np.mean(status >= Status.INFEASIBLE))
     cards.append(("Rows that could not hold", shown_number(lost, 1), "% of the control periods"))
+    if trajectory.pursuer_invalid:
+        still = str(trajectory.pursuer_invalid)
+        cards.append(("Pursuer's wheel speeds not finite", still, "control periods: it stood still"))
     return cards

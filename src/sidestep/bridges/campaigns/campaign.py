@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sidestep.bridges.campaigns.cluster import LOCAL, check_options, connected, name_of
+from sidestep.bridges.campaigns.cluster import LOCAL, check_main_guard, check_options, connected, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
 from sidestep.bridges.packages import needed
 from sidestep.store.files import OutputError
@@ -92,9 +92,9 @@ def run_campaign(
     and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
     place of `run_task`.
 
-    **Raises** `ValueError` when another call works on the folder, when it holds something else, when no
-    scheduler answers, and for bad options; and when the extra `cluster` is missing. `OutputError` when the
-    folder's disk is full; what is in it stays, and the next call goes on.
+    **Raises** `ValueError` when a script calls it without a main guard, when another call works on the folder,
+    when it holds something else, when no scheduler answers, and for bad options; and when the extra `cluster`
+    is missing. `OutputError` when the folder's disk is full; what is in it stays, and the next call goes on.
     """
     from sidestep.bridges.campaigns.table import write_table
     from sidestep.trials.campaign import Store, campaign_rows
@@ -102,6 +102,8 @@ def run_campaign(
     for package in ("distributed", "pyarrow"):
         needed(package, "cluster", "campaigns need")
     check_options(scheduler, workers, threads_per_worker)
+    if scheduler == LOCAL:
+        check_main_guard()
     store = Store(folder)
     with store.alone():
         store.begin(campaign.name, campaign.text)

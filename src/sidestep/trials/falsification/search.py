@@ -16,6 +16,7 @@ from sidestep._arrays import seed_number, whole_number
 from sidestep.learning.checkpoints import read_arrays, write_arrays
 from sidestep.learning.policy import load_policy
 from sidestep.learning.records import (
+    NOT_BEGUN,
     OUTCOMES,
     RunError,
     append_metrics,
@@ -145,7 +146,7 @@ def _load(source: str | Path) -> Any:
 
 def _stored(folder: Path, policy: Any, shield: Any) -> tuple[Scenario, Any, Any, Plan]:
     """Scenario, policy's source, shield and plan of a search begun before."""
-    config = open_run(folder)
+    config = open_run(folder, NOT_BEGUN)
     if config.get("kind") != "falsification":
         raise RunError(
             f"{folder} holds no search for counterexamples; leave out --resume, or name its folder"
