@@ -66,6 +66,7 @@ class Falsify:
 
 def run(command: Falsify, console: Console) -> int:
     """Run `sidestep falsify`; returns the exit status."""
+    from sidestep._arrays import seed_number, whole_number
     from sidestep.store.outputs import try_outputs
 
     check_options(command.film)
@@ -75,6 +76,8 @@ def run(command: Falsify, console: Console) -> int:
     if command.replay is not None:
         out = command.out or command.replay.parent
     try_outputs(files=[command.json], new=[command.film.video], folders=[out])
+    seed_number(command.seed)
+    whole_number("batch", command.batch), whole_number("most", command.most)
     if command.replay is not None:
         return _replay(command, console)
     from sidestep.learning.records import open_run
