@@ -86,10 +86,21 @@ def traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def whole_number(name: str, value: Any) -> int:
-    """`value` as an int. **Raises** `ValueError` that calls it `name` if it is not a whole number above 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} = {value!r}: it must be a whole number of at least 1")
+def whole_number(name: str, value: Any, *, least: int = 1, most: int = 2**31 - 1) -> int:
+    """`value` as an int. **Raises** `ValueError` that calls it `name` if it is not a whole number from
+    `least` to `most`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
+    if value > most:
+        raise ValueError(f"{name} = {value!r}: it must be at most {most}")
+    return int(value)
+
+
+def seed_number(value: Any, name: str = "seed") -> int:
+    """`value` as a seed. **Raises** `ValueError` that calls it `name` unless it is a whole number from 0 to
+    2^32 - 1: of a larger one JAX would drop the upper bits, and two seeds would silently be one."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**32:
+        raise ValueError(f"{name} = {value!r}: it must be a whole number from 0 to 2^32 - 1, {2**32 - 1}")
     return int(value)
 
 

@@ -25,9 +25,10 @@ from sidestep.learning.checkpoints import (
     write_arrays,
     write_checkpoint,
 )
-from sidestep.learning.records import RunError, read_json, read_metrics, read_summary
+from sidestep.learning.records import RunError, read_metrics, read_summary
 from sidestep.learning.training import start
 from sidestep.safety import as_shield
+from sidestep.store.files import read_json
 from sidestep.world import scenario_to_dict
 
 

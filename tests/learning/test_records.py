@@ -15,17 +15,15 @@ from sidestep.learning.records import (
     append_metrics,
     converged_episode,
     create_run,
-    json_safe,
     moving_mean,
     open_run,
-    read_json,
     read_metrics,
     read_summary,
     summarise,
     truncate_metrics,
-    write_json,
     write_summary,
 )
+from sidestep.store.files import OutputError, json_safe, read_json, write_json
 
 
 def episode(number=1, outcome="reached", total=990.0, steps=100, **more):
@@ -78,7 +76,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(OutputError, match="could not be written: disk full"):
         write_json(path, {"value": 2})
     monkeypatch.undo()
     assert read_json(path) == {"value": 1}
@@ -89,7 +87,7 @@ def test_kill_in_the_middle_of_writing_leaves_a_whole_file(tmp_path):
     path = tmp_path / "state.json"
     write_json(path, {"round": 0, "payload": []})
     code = (
-        "import sys; from sidestep.learning.records import write_json\n"
+        "import sys; from sidestep.store.files import write_json\n"
         "i = 0\n"
         "while True:\n"
         "    i += 1; write_json(sys.argv[1], {'round': i, 'payload': [i] * 200_000})\n"

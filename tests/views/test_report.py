@@ -8,7 +8,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from sidestep.learning.records import RunError, append_metrics, create_run, write_json
+from sidestep.learning.records import RunError, append_metrics, create_run
+from sidestep.store.files import write_json
 from sidestep.trials import save_trajectory, wilson_interval
 from sidestep.views import load_run, write_report
 

@@ -28,9 +28,11 @@ class DecisionLog:
         """Write one down; says what went wrong, after which no more is written: the robot drives on."""
         if self._writer is None:
             return ""
+        from sidestep.store.files import OutputError
+
         try:
             self._writer.onboard(stamp, decision)
-        except OSError as error:
+        except OutputError as error:
             self._writer = None
             return f"cannot be written any more: {error}"
         return ""

@@ -78,7 +78,7 @@ def _child(task: str) -> dict[str, Any]:
     except MissingPeer as error:
         return {"missing": str(error)}
     # Not before: it imports JAX, and `startup` measures children of a small process.
-    from sidestep.learning.records import json_safe
+    from sidestep.store.files import json_safe
 
     return json_safe({"peak_memory_mib": machine.peak_memory_mib(), **figures})
 

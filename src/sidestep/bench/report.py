@@ -71,7 +71,7 @@ def load_results(path: Path | None) -> dict[str, Any]:
     """What an earlier run wrote, or nothing yet. **Raises** `ValueError` for another kind of file."""
     if path is None or not path.exists():
         return {"sections": {}}
-    from sidestep.learning.records import read_json
+    from sidestep.store.files import read_json
 
     results = read_json(path)
     if not isinstance(results, dict) or not isinstance(results.get("sections"), dict):
@@ -82,9 +82,8 @@ def load_results(path: Path | None) -> dict[str, Any]:
 def save_section(path: Path | None, results: dict[str, Any]) -> None:
     """Write all sections to `path`, if there is one."""
     if path is not None:
-        from sidestep.learning.records import json_safe, write_json
+        from sidestep.store.files import json_safe, write_json
 
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, json_safe(results))
 
 
@@ -163,9 +162,8 @@ def draw(results: dict[str, Any], folder: Path) -> list[Path]:
     if not results["sections"]:
         raise ValueError(f"nothing has been measured, so there is nothing to draw into {folder}")
     from sidestep.bench.figures import draw_all
-    from sidestep.learning.records import write_bytes
+    from sidestep.store.files import write_bytes
 
-    folder.mkdir(parents=True, exist_ok=True)
     paths = draw_all(results, folder)
     write_bytes(folder / "bench.md", markdown(results).encode())
     return [*paths, folder / "bench.md"]

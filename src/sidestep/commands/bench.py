@@ -32,12 +32,14 @@ def run(command: Bench, console: Console) -> int:
     """Run `sidestep bench`; returns the exit status."""
     from sidestep.bench.report import draw, load_results, run_section, save_section, summary_lines
     from sidestep.bench.sections import SECTIONS, section
+    from sidestep.store.outputs import try_outputs
 
     names = command.sections or tuple(SECTIONS)
     for name in names:
         section(name)  # a wrong name ends it before anything is measured
     if command.draw_only and (command.json is None or command.figures is None):
         raise ValueError("--draw-only needs --json FILE, which is read, and --figures FOLDER")
+    try_outputs(files=[None if command.draw_only else command.json], folders=[command.figures])
     results: dict[str, Any] = load_results(command.json)
     failed = False
     for name in () if command.draw_only else names:

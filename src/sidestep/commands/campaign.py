@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import CampaignBar, write_json_file
+from sidestep.commands.common import CampaignBar, going_on, stood_still, write_json_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -44,10 +43,13 @@ class Campaign:
 
 def run(command: Campaign, console: Console) -> int:
     """Run `sidestep campaign`; returns the exit status: 1 when a job failed or the scheduler was lost."""
+    from sidestep.store.outputs import try_outputs
     from sidestep.trials.campaign import Store, load_campaign
 
-    plan = load_campaign(command.file)
     folder = command.out or Path("runs") / command.file.stem
+    if not command.dry_run:
+        try_outputs(files=[command.json], folders=[folder])
+    plan = load_campaign(command.file)
     if command.dry_run:
         from sidestep.bridges.campaigns.cluster import check_options
 
@@ -57,7 +59,8 @@ def run(command: Campaign, console: Console) -> int:
         return 0
     from sidestep.bridges.campaigns import run_campaign
 
-    with CampaignBar(console, plan.name) as show:
+    going = going_on(folder, *_again(command, folder))
+    with going, CampaignBar(console, plan.name) as show:
         outcome = run_campaign(
             plan, folder, scheduler=command.scheduler, workers=command.workers,
             threads_per_worker=command.threads_per_worker, progress=show,
@@ -115,6 +118,9 @@ def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Con
     )
     if outcome.damaged:
         say(f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
+    still = sum(row.get("pursuer_invalid") or 0 for row in outcome.rows)
+    if still:
+        say(f"Warning: {stood_still(still)}")
     used = {row["version_sidestep"] for row in outcome.rows}
     if len(used) > 1:
         say(f"Results come from different versions of sidestep: {', '.join(sorted(used))}")
@@ -125,13 +131,18 @@ def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Con
         say(f"and {len(outcome.failed) - _FAILURES_SHOWN} more failed; --json lists all")
     if outcome.complete:
         return
-    words = ["sidestep", "campaign", str(command.file), "--out", str(folder)]
+    reason = "Jobs failed" if outcome.stopped is None else outcome.stopped[0].upper() + outcome.stopped[1:]
+    say(f"{reason}. What is done stays done; go on with: {command_line(*_again(command, folder))}")
+
+
+def _again(command: Campaign, folder: Path) -> list[str]:
+    """What to type after `sidestep` to go on."""
+    words = ["campaign", str(command.file), "--out", str(folder)]
     if command.scheduler != "local":
         words += ["--scheduler", command.scheduler]
     for option, value in (("workers", command.workers), ("threads-per-worker", command.threads_per_worker)):
         words += [] if value is None else [f"--{option}", str(value)]
-    reason = "Jobs failed" if outcome.stopped is None else outcome.stopped[0].upper() + outcome.stopped[1:]
-    say(f"{reason}. What is done stays done; go on with: {shlex.join(words)}")
+    return words
 
 
 def comparison_tables(comparisons: Sequence[Comparison]) -> list[Any]:

@@ -60,8 +60,10 @@ def run(command: Certify, console: Console) -> int:
     from rich.console import Console as RichConsole
 
     from sidestep.safety.certificate import certify
+    from sidestep.store.outputs import try_outputs
     from sidestep.world import load_scenario
 
+    try_outputs(files=[command.json, *_figure_files(command)])
     overrides = parse_overrides(command.set)
     given = {
         argument: 0.0
@@ -101,6 +103,14 @@ def run(command: Certify, console: Console) -> int:
         certificate.start_margin is None or certificate.start_margin >= 0.0
     )
     return 1 if command.strict and not certified else 0
+
+
+def _figure_files(command: Certify) -> tuple[Path, ...]:
+    if command.figure is None:
+        return ()
+    from sidestep.views.style import figure_files
+
+    return figure_files(command.figure)
 
 
 def _point(text: str) -> tuple[float, float]:

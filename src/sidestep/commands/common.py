@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import abc
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
+
+from sidestep._program import command as command_line
+from sidestep.store.files import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -47,6 +51,8 @@ def policy_and_scenario(
         return run, *scenario_of_run(None, scenario, overrides)
     from sidestep.learning import load_policy
 
+    if not Path(run).exists():
+        raise ValueError(f"{run} does not exist; name a run folder, a policy.npz or goal-seeking")
     return load_policy(run), *scenario_of_run(run, scenario, overrides)
 
 
@@ -65,12 +71,37 @@ def scenario_of_run(
     return load_scenario(scenario or "paper", **changes), config
 
 
+@contextmanager
+def going_on(folder: Path, *words: object) -> Iterator[None]:
+    """Adds to the error of what cannot be written into `folder` any more the command to go on with."""
+    try:
+        yield
+    except OutputError as error:
+        raise advised(error, folder, *words) from error.__cause__
+
+
+def advised(error: OutputError, folder: Path, *words: object) -> OutputError:
+    """The error with the command to go on with, if anything was begun in `folder`."""
+    if not any((folder / name).is_file() for name in ("config.json", "campaign.json")):
+        return error
+    first = "With more room there" if error.full else "When that is mended"
+    return error.and_kept(f"{first}, go on with: {command_line(*words)}")
+
+
+def stood_still(periods: int, episodes: int | None = None) -> str:
+    """What to say where a pursuer's wheel speeds were not finite, in so many control periods."""
+    where = "" if episodes is None else f" of {episodes} episodes"
+    return (
+        f"the pursuer's wheel speeds were not finite in {periods} control periods{where}, and it stood "
+        "still: what was not captured then is not safe for that"
+    )
+
+
 def write_json_file(path: Path | None, data: Any) -> None:
     """Write `data` to `path`, if there is one; folders on the way to it are made."""
     if path is not None:
-        from sidestep.learning.records import write_json
+        from sidestep.store.files import write_json
 
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, data)
 
 

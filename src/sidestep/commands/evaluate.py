@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, write_json_file
+from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, stood_still, write_json_file
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
@@ -51,23 +51,26 @@ class Evaluate:
 
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
+    from sidestep._arrays import seed_number, whole_number
+    from sidestep.store.outputs import try_outputs
     from sidestep.trials import episode_key, rollout
     from sidestep.trials import evaluate as run_evaluation
 
+    check_options(command.film)
+    try_outputs(files=[command.json], new=[command.log, command.film.video])
+    whole_number("episodes", command.episodes), whole_number("batch", command.batch)
+    seed_number(command.seed)
     policy, scenario, config = policy_and_scenario(command.run, command.scenario, command.set)
     if not 0 <= command.log_episode < command.episodes:
         raise ValueError(
             f"log_episode = {command.log_episode}: it must be the number of an episode, 0 to "
             f"{command.episodes - 1}"
         )
-    if command.log is not None and command.log.exists():
-        raise ValueError(f"{command.log} exists already; give the log another name")
     if command.video_episode != "worst" and not _is_number(command.video_episode, command.episodes):
         raise ValueError(
             f"video_episode = {command.video_episode}: it must be worst or the number of an episode, 0 to "
             f"{command.episodes - 1}"
         )
-    check_options(command.film)
     shield = command.shield or config.get("shield", "joint")
     pursuer = command.pursuer or config.get("pursuer", "nash")
     with CountBar(console, f"{shield} shield, {pursuer}") as show:
@@ -134,4 +137,6 @@ def evaluation_table(evaluation: Evaluation) -> Any:
         f"shield corrects {figures['intervention_rate']:.1%} of steps, cannot satisfy all rows in "
         f"{figures['infeasible_rate']:.2%}"
     )
+    if figures["pursuer_invalid"]:
+        table.caption += "; " + stood_still(figures["pursuer_invalid"], figures["pursuer_invalid_episodes"])
     return table

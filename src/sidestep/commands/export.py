@@ -51,11 +51,16 @@ def run(command: Export, console: Console) -> int:
     """Run `sidestep export`; returns the exit status."""
     from sidestep.learning import load_policy
     from sidestep.safety import Budget, GameShield, make_shield
+    from sidestep.store.files import is_stream
+    from sidestep.store.outputs import try_outputs
 
     if command.format not in ("onnx", "jax"):
         raise ValueError(f"unknown format '{command.format}'; use onnx or jax")
-    if command.out.exists() and not command.overwrite:
+    if command.run == "goal-seeking":
+        raise ValueError("goal-seeking is built in and has nothing to export; name the run of a training")
+    if command.out.exists() and not command.overwrite and not is_stream(command.out):
         raise ValueError(f"{command.out} exists already; give another file, or --overwrite to replace it")
+    try_outputs(files=[command.out, command.json])
     policy = load_policy(command.run)
     scenario, config = scenario_of_run(command.run, command.scenario, command.set)
     name = command.shield or ("game" if command.format == "onnx" else config.get("shield", "joint"))

@@ -12,7 +12,9 @@ from sidestep.commands.common import (
     CountBar,
     Overrides,
     ShieldName,
+    going_on,
     parse_overrides,
+    stood_still,
     write_json_file,
 )
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
@@ -64,22 +66,30 @@ class Falsify:
 
 def run(command: Falsify, console: Console) -> int:
     """Run `sidestep falsify`; returns the exit status."""
+    from sidestep._arrays import seed_number, whole_number
+    from sidestep.store.outputs import try_outputs
+
     check_options(command.film)
     if command.film.video is not None and command.replay is None:
         raise ValueError("--video shows one counterexample: give it with --replay")
+    out = command.out or Path("runs") / f"falsify-{command.shield}"
+    if command.replay is not None:
+        out = command.out or command.replay.parent
+    try_outputs(files=[command.json], new=[command.film.video], folders=[out])
+    seed_number(command.seed)
+    whole_number("batch", command.batch), whole_number("most", command.most)
     if command.replay is not None:
         return _replay(command, console)
     from sidestep.learning.records import open_run
     from sidestep.trials.falsification import ATTACKS, Plan, certified_clearance, falsify
     from sidestep.world import load_scenario
 
-    out = command.out or Path("runs") / f"falsify-{command.shield}"
     overrides = parse_overrides(command.set)
     if command.scenario is None and (Path(command.policy) / "config.json").is_file():
         scenario = load_scenario("paper", **{**open_run(command.policy)["scenario"], **overrides})
     else:
         scenario = load_scenario(command.scenario or "paper", **overrides)
-    with SearchBar(console) as show:
+    with going_on(out, "falsify", "--out", out, "--resume"), SearchBar(console) as show:
         plan = Plan(
             guaranteed_clearance=None if command.resume else certified_clearance(scenario, command.shield),
             seed=command.seed,
@@ -191,9 +201,12 @@ def findings(found: Falsification) -> list[str]:
     from sidestep.trials.falsification import ASSUMPTIONS
 
     summary = found.summary
+    lines = []
+    if summary["pursuer_invalid"]:
+        lines.append(f"Warning: {stood_still(summary['pursuer_invalid'])}.")
     if not summary["counterexamples"]:
-        return [f"No counterexample in {summary['episodes']} episodes."]
-    lines = [f"First counterexample after {summary['first_seconds']:.1f} s, compiling included."]
+        return [*lines, f"No counterexample in {summary['episodes']} episodes."]
+    lines += [f"First counterexample after {summary['first_seconds']:.1f} s, compiling included."]
     for name, count in summary["by_assumption"].items():
         if name in ASSUMPTIONS:
             lines.append(f"  {count} broke the assumption that {ASSUMPTIONS[name]}")
@@ -268,7 +281,6 @@ def _replay(command: Falsify, console: Console) -> int:
         broken = ASSUMPTIONS.get(about["assumption"], about["assumption"])
         console.print(f"Assumption broken: {broken}. Here {about['words']}.", highlight=False)
     folder = command.out or command.replay.parent
-    folder.mkdir(parents=True, exist_ok=True)
     console.print(f"Figure: {draw(counterexample, played, folder / command.replay.stem)}", highlight=False)
     write_video(command.film, played.scenario, trajectory, about["shield"], console)
     facts = {**about, "same": played.same, "exact": played.exact}

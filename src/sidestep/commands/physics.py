@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sidestep import _interrupts
-from sidestep.commands.common import CountBar
+from sidestep.commands.common import CountBar, stood_still
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,9 +30,13 @@ class Played:
 
 
 def check_amounts(command: Twin | Fly) -> None:
-    """**Raises** `ValueError` for a number of seeds or a video that there cannot be."""
-    if command.seeds < 1:
-        raise ValueError(f"seeds = {command.seeds}: at least 1 is needed")
+    """**Raises** `ValueError` for a number of seeds, or an output, that there cannot be."""
+    from sidestep._arrays import seed_number, whole_number
+
+    seed_number(command.seed)
+    whole_number("seeds", command.seeds, most=2**32 - command.seed)
+    if command.steps is not None:
+        whole_number("steps", command.steps)
     if not command.speed > 0.0:
         raise ValueError(f"speed = {command.speed}: it must be greater than 0")
     if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:
@@ -44,6 +48,10 @@ def check_amounts(command: Twin | Fly) -> None:
         from sidestep.views.video_files import check_video
 
         check_video(command.video)
+    from sidestep.store.outputs import try_outputs
+
+    log = getattr(command, "log", None)
+    try_outputs(files=[command.json, command.video], new=[log], folders=[command.out])
 
 
 def video_options(command: Twin | Fly) -> dict[str, Any]:
@@ -125,7 +133,6 @@ def draw_beside_simulation(
 
     scenario = episode.scenario
     simulation = rollout(scenario, policy, shield, command.pursuer, episode.seed, steps=command.steps)
-    stem.parent.mkdir(parents=True, exist_ok=True)
     save_trajectory(stem.with_suffix(".npz"), episode.trajectory, scenario, about)
     png, pdf = twin_figure(scenario, simulation, episode.trajectory, stem, shield=command.shield, **looks)
     console.print(f"Figure: {png} and {pdf}", soft_wrap=True)
@@ -177,3 +184,6 @@ def episode_table(figures: list[dict[str, Any]], what: str, console: Console) ->
         low, high = counts[f"{name}_rate_low"], counts[f"{name}_rate_high"]
         table.add_row(name.replace("_", " "), str(counts[name]), f"{low:.2%} to {high:.2%}")
     console.print(table)
+    still = sum(figure["pursuer_invalid"] for figure in figures)
+    if still:
+        console.print(f"Warning: {stood_still(still)}.", highlight=False)

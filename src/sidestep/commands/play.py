@@ -46,8 +46,10 @@ class Play:
 
 def run(command: Play, console: Console) -> int:
     """Run `sidestep play` until Ctrl-C; returns the exit status."""
+    from sidestep._arrays import seed_number
     from sidestep.views.play import Hosting, Limits, serve
 
+    seed_number(command.seed)
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     hosting = Hosting(
         scenario,

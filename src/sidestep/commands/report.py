@@ -34,6 +34,8 @@ class Report:
 
 def run(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
+    from sidestep.store.files import OutputError
+    from sidestep.store.outputs import try_outputs
     from sidestep.views import write_report
 
     if not command.runs:
@@ -48,9 +50,15 @@ def run(command: Report, console: Console) -> int:
     folders = _run_folders(command.runs, console)
     path = command.out or command.runs[0] / "report.html"
     _refuse_other_files(path)
-    for folder in folders:
+    figures = path.with_name("figures" if path.stem == "report" else f"{path.stem}-figures")
+    try_outputs(files=[path], folders=[figures])
+    unseen = [folder for folder in folders if command.episodes and _is_unseen(folder)]
+    try:
+        try_outputs(folders=unseen)
+    except OutputError as error:
+        raise error.and_kept("Its episodes are to be kept there; --episodes 0 reports without any") from error
+    for folder in unseen:
         _look_closer(folder, command.episodes, console)
-    figures = None if path.stem == "report" else path.with_name(f"{path.stem}-figures")
     written = write_report(folders, path, figures=figures)
     console.print(f"Report with figures: {written}", highlight=False)
     return 0
@@ -58,7 +66,8 @@ def run(command: Report, console: Console) -> int:
 
 def _run_folders(paths: tuple[Path, ...], console: Console) -> list[Path]:
     """The run folders, those of a reproduction one by one. A run counts once."""
-    from sidestep.learning.records import RunError, read_json
+    from sidestep.learning.records import RunError
+    from sidestep.store.files import read_json
 
     folders: list[Path] = []
     for path in paths:
@@ -82,21 +91,24 @@ def _run_folders(paths: tuple[Path, ...], console: Console) -> list[Path]:
 
 def _refuse_other_files(path: Path) -> None:
     """A report may be written anew, but nothing else written over."""
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; give --out the name of an HTML file")
     if path.is_file():
         with path.open("rb") as file:
             if b"<title>sidestep" not in file.read(1000):
                 raise ValueError(f"{path} exists already and is no report; give --out another name")
 
 
-def _look_closer(folder: Path, episodes: int, console: Console) -> None:
-    """Run random episodes with the policy of a run whose folder has no record of any, and keep them there."""
-    from sidestep.learning.records import read_json
-    from sidestep.trials import load_survey, save_survey, survey_run
+def _is_unseen(folder: Path) -> bool:
+    """Whether a run has a policy, but no record of any episode with it."""
+    from sidestep.trials import load_survey
 
-    if not episodes or not (folder / "policy.npz").exists() or load_survey(folder) is not None:
-        return
+    return (folder / "policy.npz").exists() and load_survey(folder) is None
+
+
+def _look_closer(folder: Path, episodes: int, console: Console) -> None:
+    """Run random episodes with the policy of a run, and keep them in its folder."""
+    from sidestep.store.files import read_json
+    from sidestep.trials import save_survey, survey_run
+
     config = read_json(folder / "config.json")
     try:
         with CountBar(console, f"{config['shield']} shield, {episodes} episodes") as show:
@@ -109,14 +121,16 @@ def _look_closer(folder: Path, episodes: int, console: Console) -> None:
 
 
 def _report_episode(command: Report, console: Console) -> int:
+    from sidestep.store.outputs import try_outputs
     from sidestep.views import write_episode_report
 
     path, *others = command.runs
     if others:
         raise ValueError("a report is of runs or of one episode")
-    scenario, trajectory, about, notes = _read_episode(path)
     out = command.out or path.with_suffix(".html")
     _refuse_other_files(out)
+    try_outputs(files=[out], new=[command.film.video], folders=[out.with_name("figures")])
+    scenario, trajectory, about, notes = _read_episode(path)
     title = f"{'Log' if path.suffix == '.mcap' else 'Recording'} {path.stem}"
     written = write_episode_report(scenario, trajectory, out, title=title, about=about, notes=notes)
     for note in notes:

@@ -15,6 +15,7 @@ from sidestep.commands.common import (
     Overrides,
     PursuerName,
     TrainingBar,
+    advised,
     parse_overrides,
     write_json_file,
 )
@@ -59,11 +60,14 @@ class Reproduce:
 def run(command: Reproduce, console: Console) -> int:
     """Run `sidestep reproduce`; returns the exit status."""
     from sidestep.learning import make_options
-    from sidestep.learning.records import read_summary, write_bytes
+    from sidestep.learning.records import read_summary
+    from sidestep.store.files import OutputError, write_bytes
+    from sidestep.store.outputs import try_outputs
     from sidestep.trials.reproduction import reproduce as run_study
     from sidestep.views import comparison_sections, markdown_tables, write_report
     from sidestep.world import load_scenario
 
+    try_outputs(files=[command.json], folders=[command.out])
     try:
         studies = run_study(
             command.out,
@@ -81,6 +85,9 @@ def run(command: Reproduce, console: Console) -> int:
     except KeyboardInterrupt:
         console.print(f"Interrupted. Continue with: sidestep reproduce --out {command.out} --resume")
         return 130
+    except OutputError as error:
+        advice = advised(error, command.out, "reproduce", "--out", command.out, "--resume")
+        raise advice from error.__cause__
     summary = read_summary(command.out)
     sections = comparison_sections(summary)
     console.print("Columns: what the paper reports, then our measurements under each shield.\n")

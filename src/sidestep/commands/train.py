@@ -12,6 +12,7 @@ from sidestep.commands.common import (
     ScenarioName,
     ShieldName,
     TrainingBar,
+    going_on,
     parse_overrides,
     write_json_file,
 )
@@ -51,8 +52,10 @@ def run(command: Train, console: Console) -> int:
     """Run `sidestep train`; returns the exit status."""
     from sidestep.learning import make_options, resume_settings
     from sidestep.learning import train as run_training
+    from sidestep.store.outputs import try_outputs
     from sidestep.world import load_scenario
 
+    try_outputs(files=[command.json], folders=[command.out])
     if command.resume:
         settings = resume_settings(command.out)
         settings["episodes"] = max(settings["episodes"], command.episodes)
@@ -65,7 +68,8 @@ def run(command: Train, console: Console) -> int:
             "episodes": command.episodes,
             "options": make_options(**parse_overrides(command.learner)),
         }
-    with TrainingBar(console, f"training, {settings['shield']}") as show:
+    going = going_on(command.out, "train", "--out", command.out, "--resume")
+    with going, TrainingBar(console, f"training, {settings['shield']}") as show:
         training = run_training(**settings, out=command.out, resume=command.resume, progress=show)
     console.print(training_table(training.summary))
     write_json_file(command.json, training.summary)

@@ -93,8 +93,6 @@ def run(command: Twin, console: Console) -> int:
     from sidestep.safety import Budget
 
     check_amounts(command)
-    if command.log is not None and command.log.exists():
-        raise ValueError(f"{command.log} exists already; give the log another name")
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     scenario.check_built_in("the twin", "`sidestep fly` flies a quadrotor")
     options = TwinOptions(

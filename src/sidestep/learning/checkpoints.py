@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.learning.records import RunError, write_bytes
+from sidestep.learning.records import RunError
+from sidestep.store.files import write_bytes
 
 _NAME = re.compile(r"episodes-(\d+)\.npz")
 _KEPT = 2

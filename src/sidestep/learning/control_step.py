@@ -95,7 +95,7 @@ def control_step(
     `pursuer(scenario, world, key) -> wheel speeds (2,)` in m/s; `nominal` velocity in m/s, world axes.
 
     **Returns** the world one period later, the shield's new memory, the `Events` of the period, the
-    `ShieldResult`, and the wheel speeds (m, 2) in m/s that the pursuers asked for.
+    `ShieldResult`, and the wheel speeds (m, 2) in m/s that the pursuers asked for, see `pursue`.
     """
     result, memory = filter_in_lanes(shield, world, nominal, memory)
     wheel_speeds = pursue(scenario, pursuer, world, key)

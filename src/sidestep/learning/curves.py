@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sidestep.store.files import append_bytes, make_folder
+
 
 def _protos() -> Any:
     # Imported where it is needed: by trainings only, and it takes a while.
@@ -28,7 +30,7 @@ class Curves:
     def __init__(self, folder: str | Path, purge_step: int):
         event = _protos()
         place = Path(folder) / "curves"
-        place.mkdir(parents=True, exist_ok=True)
+        make_folder(place)
         # Files are named by the second; the count keeps a resume within it from overwriting what is there.
         count = len(list(place.glob("events.out.tfevents.*")))
         self._path = place / f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{count:06d}"
@@ -71,5 +73,4 @@ class Curves:
             for part in (length, data):
                 records += [part, struct.pack("<I", masked_crc32c(part))]
         # Unbuffered and at once: a chunk is in the file or not, whatever interrupts.
-        with open(self._path, "ab", buffering=0) as file:
-            file.write(b"".join(records))
+        append_bytes(self._path, b"".join(records))

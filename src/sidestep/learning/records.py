@@ -5,15 +5,24 @@
 """
 
 import json
-import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from sidestep.store.files import (
+    UnreadableError,
+    append_bytes,
+    json_safe,
+    make_folder,
+    read_json,
+    write_bytes,
+    write_json,
+    writing,
+)
 
 OUTCOMES = ("captured", "collided", "reached", "timed_out")
 """How an episode ends; exclusive, the first that applies."""
@@ -26,81 +35,21 @@ CONVERGENCE_RETURN = 940.0
 _CONFIG, _METRICS, _SUMMARY = "config.json", "metrics.jsonl", "summary.json"
 
 
+NOT_BEGUN = "leave out --resume to start one there"
+"""What to do about a run that is to go on where there is none."""
+
+
 class RunError(ValueError):
     """A run folder that cannot be used as asked; the message says what to do instead."""
 
 
-def json_safe(value: Any) -> Any:
-    """`value` as plain JSON: arrays become lists, numbers that are not finite become null."""
-    if isinstance(value, Mapping):
-        return {str(key): json_safe(item) for key, item in value.items()}
-    if isinstance(value, (str, bool)) or value is None:
-        return value
-    if isinstance(value, (list, tuple)):
-        return [json_safe(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    array = np.asarray(value)
-    if array.ndim > 0:
-        return [json_safe(item) for item in array]
-    number = array.item()
-    return None if isinstance(number, float) and not math.isfinite(number) else number
-
-
-@contextmanager
-def whole_file(path: str | Path) -> Iterator[Path]:
-    """A path beside `path` to write to; what is there at the end takes its place, and nothing if that fails.
-
-    Synced to disk, renamed over `path`, and the folder synced too: a reader, or a restart after a kill, sees
-    the old file or the new one.
-    """
-    path = Path(path)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def _read(path: Path) -> Any:
+    """A JSON file of a run. **Raises** `RunError` when it is missing or no JSON."""
     try:
-        yield beside
-        with open(beside, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all, see `whole_file`."""
-    with whole_file(path) as beside:
-        beside.write_bytes(content)
-
-
-def sync_folder(folder: Path) -> None:
-    """Sync what a folder lists to disk, where the system can do that."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_json(path: str | Path, data: Any) -> None:
-    """Write `data` as JSON, whole or not at all; numbers that are not finite become null."""
-    text = json.dumps(json_safe(data), indent=2, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
-
-
-def read_json(path: str | Path) -> Any:
-    """What `write_json` wrote. **Raises** `RunError` when the file is missing or no JSON."""
-    path = Path(path)
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise RunError(
-            f"{path} does not exist: {path.parent} is no run folder, or its run never started"
-        ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RunError(f"{path} is not readable JSON ({error}); restore it or start another run") from None
+        return read_json(path)
+    except UnreadableError as error:
+        missing = "" if path.exists() else f": {path.parent} is no run folder, or its run never started"
+        raise RunError(f"{error}{missing}") from None
 
 
 def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
@@ -118,7 +67,7 @@ def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
             "or choose another --out"
         )
     for name in ("checkpoints", "figures"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        make_folder(folder / name)
     write_json(folder / _CONFIG, config)
     return folder
 
@@ -130,14 +79,18 @@ def _is_left_by_a_kill(entry: Path) -> bool:
     return entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp"
 
 
-def open_run(folder: str | Path) -> dict[str, Any]:
-    """The configuration of an existing run. **Raises** `RunError` when `folder` holds none."""
+def open_run(folder: str | Path, otherwise: str = "") -> dict[str, Any]:
+    """The configuration of an existing run.
+
+    **Raises** `RunError` when `folder` holds none; `otherwise` says what to do then.
+    """
     folder = Path(folder)
     if not (folder / _CONFIG).is_file():
-        raise RunError(f"{folder} holds no run (no {_CONFIG}); leave out --resume to start one there")
+        what = f"holds no run (no {_CONFIG})" if folder.exists() else "does not exist"
+        raise RunError(f"{folder} {what}" + (f"; {otherwise}" if otherwise else ""))
     for name in ("checkpoints", "figures"):
-        (folder / name).mkdir(exist_ok=True)
-    return read_json(folder / _CONFIG)
+        make_folder(folder / name)
+    return _read(folder / _CONFIG)
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
@@ -166,11 +119,11 @@ def append_metrics(folder: str | Path, episodes: Iterable[Mapping[str, Any]]) ->
     """Append one line per episode and sync to disk; a last line cut off by a kill is removed first."""
     path = Path(folder) / _METRICS
     text = "".join(json.dumps(json_safe(episode), allow_nan=False) + "\n" for episode in episodes)
-    with open(path, "ab+") as file:
-        file.truncate(_end_of_last_line(file))
-        file.write(text.encode())
-        file.flush()
-        os.fsync(file.fileno())
+    with writing(path), open(path, "ab+") as file:
+        end = _end_of_last_line(file)
+        if end < file.seek(0, os.SEEK_END):
+            file.truncate(end)
+    append_bytes(path, text.encode(), sync=True)
 
 
 def _end_of_last_line(file: Any) -> int:
@@ -269,4 +222,4 @@ def write_summary(folder: str | Path, summary: Mapping[str, Any]) -> None:
 
 def read_summary(folder: str | Path) -> dict[str, Any]:
     """`summary.json` of a run. **Raises** `RunError` when it has none yet."""
-    return read_json(Path(folder) / _SUMMARY)
+    return _read(Path(folder) / _SUMMARY)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 
 import sidestep
 from sidestep import _interrupts
+from sidestep._arrays import seed_number, whole_number
 from sidestep.learning import records
 from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
@@ -22,6 +24,7 @@ from sidestep.learning.policy import LearnedPolicy, write_policy
 from sidestep.learning.training import Report, TrainState, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
+from sidestep.store.files import OutputError, json_safe, write_json
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
 CHUNK = 100
@@ -71,7 +74,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
     tally = jax.tree.map(lambda leaf: np.asarray(leaf)[ended], report.tally)
     outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended]
     return [
-        records.json_safe(
+        json_safe(
             {
                 "episode": done + i + 1,
                 "outcome": records.OUTCOMES[outcome[i]],
@@ -94,7 +97,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
 
     **Raises** `RunError` when `folder` holds no run.
     """
-    config = records.open_run(folder)
+    config = records.open_run(folder, records.NOT_BEGUN)
     fields = dict(config["scenario"])
     # The stored fields are complete, so whichever preset they start from leaves no trace.
     return {
@@ -134,14 +137,10 @@ def train(
     `episodes` may be larger; `progress` is called after every chunk of `chunk` decisions.
 
     **Raises** `ValueError` for a bad argument, `RunError` when `out` already holds something and `resume` is
-    not set, or holds nothing to resume.
+    not set, or holds nothing to resume, and `OutputError` when the run cannot be written any more: the newest
+    checkpoint stays, and the run can be resumed from it.
     """
-    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("chunk", chunk, 1)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
-    if seed >= 2**32:
-        # JAX would drop the upper bits, and two seeds would silently be one.
-        raise ValueError(f"seed = {seed!r}: it must be less than 2^32")
+    whole_number("episodes", episodes), whole_number("chunk", chunk), seed_number(seed)
     options = make_options() if options is None else options
     guard, hunter = as_shield(shield, scenario), as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)
@@ -201,24 +200,49 @@ def train(
                 progress(_progress(metrics, state, episodes, steps / seconds))
     except KeyboardInterrupt:
         interrupted = True
-    finally:
-        figures = summary()
+    except BaseException as error:
         if folder is not None:
-            records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
-            write_checkpoint(folder, state, wall_seconds=earlier + time.perf_counter() - begun)
-            records.write_summary(folder, figures)
+            # What went wrong first is said.
+            with suppress(OutputError):
+                _keep(folder, metrics, state, earlier + time.perf_counter() - begun, summary())
+            if isinstance(error, OutputError):
+                raise error.and_kept(_kept(folder)) from error.__cause__
+        raise
+    figures = summary()
 
     policy = LearnedPolicy(state.learner.actor, options.decision_steps)
-    if folder is not None and not interrupted:
-        write_policy(folder, policy)
+    if folder is not None:
+        try:
+            _keep(folder, metrics, state, earlier + time.perf_counter() - begun, figures)
+            if not interrupted:
+                write_policy(folder, policy)
+        except OutputError as error:
+            raise error.and_kept(_kept(folder)) from error.__cause__
     return Training(policy, figures, metrics, state, interrupted, folder, chunk_seconds)
+
+
+def _keep(
+    folder: Path, metrics: list[dict[str, Any]], state: TrainState, seconds: float, figures: dict[str, Any]
+) -> None:
+    """Bring the run's files up to this state."""
+    records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
+    write_checkpoint(folder, state, wall_seconds=seconds)
+    records.write_summary(folder, figures)
+
+
+def _kept(folder: Path) -> str:
+    """What a run that could not go on can be resumed from."""
+    kept = list_checkpoints(folder)
+    if not kept:
+        return f"Nothing of the training is kept in {folder} yet"
+    return f"Kept: {kept[-1]}, the newest checkpoint, from which the run can be resumed"
 
 
 def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
     """**Raises** `RunError` naming what differs from the run that `folder` holds."""
-    stored = records.open_run(folder)
+    stored = records.open_run(folder, records.NOT_BEGUN)
     for name in ("scenario", "learner", "shield", "pursuer", "seed"):
-        if records.json_safe(stored.get(name)) != records.json_safe(config[name]):
+        if json_safe(stored.get(name)) != json_safe(config[name]):
             raise records.RunError(
                 f"{folder} was begun with another {name}: {stored.get(name)!r}, not {config[name]!r}; "
                 "resume without changing it, or start another run with --out"
@@ -237,7 +261,7 @@ def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tup
         return example, 0.0
     state, manifest = read_checkpoint(folder, example)
     records.truncate_metrics(folder, int(state.episodes))
-    records.write_json(folder / "config.json", config)
+    write_json(folder / "config.json", config)
     return state, float(manifest["wall_seconds"])
 
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sidestep._arrays import Lanes, Scalar, lane_by_lane, real, stack
+from sidestep._arrays import AnyArray, Lanes, Scalar, fold, lane_by_lane, real, stack
 from sidestep.pursuit.game import CaptureGame
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -33,6 +33,8 @@ class Pursuer(eqx.Module):
     """
 
     takes_lanes: ClassVar[bool] = False
+    always_finite: ClassVar[bool] = False
+    """Whether its answer is finite in every world that is; others are watched, see `pursue`."""
 
     @abc.abstractmethod
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
@@ -68,6 +70,7 @@ class Nash(Pursuer):
     """
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         game = CaptureGame.of(scenario)
@@ -116,6 +119,7 @@ class TurnThenDrive(Pursuer):
     """Turns in place until it faces the evader, then drives straight at it, correcting as it goes."""
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         return _toward(scenario, bearing_of(to_pursuer_frame(world.evader, world.pursuer)))
@@ -126,6 +130,7 @@ class TurnWhileDriving(Pursuer):
     """Never stops driving forward: turns toward the evader on arcs no tighter than about its inner wheel."""
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         bearing = bearing_of(to_pursuer_frame(world.evader, world.pursuer))
@@ -141,6 +146,7 @@ class PurePursuit(Pursuer):
     """
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         z = to_pursuer_frame(world.evader, world.pursuer)
@@ -162,6 +168,7 @@ class Interceptor(Pursuer):
     """
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         z = to_pursuer_frame(world.evader, world.pursuer)
@@ -193,15 +200,31 @@ class Still(Pursuer):
     """Never moves."""
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         return jnp.zeros_like(world.pursuer[:2])
+
+
+def _watched(scenario: Scenario, wheels: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
+    """What the pursuer drives, but what it asked for where that is not finite."""
+    finite = jnp.isfinite(wheels[0]) & jnp.isfinite(wheels[1])
+    return jnp.where(finite, scenario.drivable(wheels), wheels)
+
+
+def without_answer(wheel_speeds: Float[AnyArray, "m 2 *lanes"]) -> Bool[Array, "*lanes"]:
+    """Whether any pursuer answered with wheel speeds that are not finite: it stands still instead, and an
+    evader that it does not catch is not safe for that."""
+    return ~fold(jnp.logical_and, jnp.isfinite(wheel_speeds[:, 0]) & jnp.isfinite(wheel_speeds[:, 1]), True)
 
 
 def pursue(
     scenario: Scenario, pursuer: Callable[..., Any], world: World, key: Any
 ) -> Float[Array, "m 2 *lanes"]:
     """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
+
+    Each pair is within what the pursuer can drive, or not finite as the strategy answered, which physics take
+    for a stop: see `without_answer`.
 
     A strategy with a method `steer_all(scenario, world) -> (m, 2)` is asked for all of them at once instead.
     Worlds in lanes need a key each, unless the strategy takes lanes: those draw nothing.
@@ -212,17 +235,19 @@ def pursue(
 
     def steer(world: World, key: Any) -> Float[Array, "m 2 *lanes"]:
         if together is not None:
-            return jax.vmap(scenario.drivable)(together(scenario, world))
+            return jax.vmap(lambda wheels: _watched(scenario, wheels))(together(scenario, world))
         count = scenario.pursuer_count
         keys = [key] * count if world.lanes else jax.random.split(key, count)
         answers = []
         for index in range(count):
-            wheels = jnp.asarray(pursuer(scenario, world.seen_by(index), keys[index]))
+            seen, watched = world.seen_by(index), isinstance(pursuer, Pursuer) and not pursuer.always_finite
+            ask = pursuer.steer if watched else pursuer
+            wheels = jnp.asarray(ask(scenario, seen, keys[index]))
             if wheels.shape != world.evader.shape:
                 raise ValueError(
                     f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
                 )
-            answers.append(real(wheels))
+            answers.append(_watched(scenario, real(wheels)) if watched else real(wheels))
         return jnp.stack(answers)
 
     if getattr(pursuer, "takes_lanes", False):

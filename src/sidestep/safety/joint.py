@@ -14,7 +14,7 @@ from sidestep.pursuit import Pursuer, make_pursuer, pursue
 from sidestep.safety.budget import Budget
 from sidestep.safety.by_need import by_need
 from sidestep.safety.look_ahead import STRETCHES, WISHES, Outlook, clearance, imagine, moved, stretch, wish
-from sidestep.safety.shields import GameShield, Shield, ShieldResult
+from sidestep.safety.shields import GameShield, Shield, ShieldResult, correction
 from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -183,7 +183,7 @@ class JointShield(Shield):
         evasive = eqx.tree_at(
             lambda result: (result.status, result.intervention),
             evasive,
-            (jnp.maximum(evasive.status, Status.CORRECTED), norm(evasive.action - wanted)),
+            (jnp.maximum(evasive.status, Status.CORRECTED), correction(evasive.action, wanted)),
         )
         result = select(decision.accept, greedy, evasive)
         return result, JointMemory(

@@ -34,7 +34,7 @@ class ShieldResult(eqx.Module):
     - `status` see `Status`
     - `barriers (m + k,)` h in m, pursuers first; -inf where the world was not finite
     - `slack` m/s by which the action keeps the tightest row (negative: violates); +inf without rows
-    - `intervention` |action - nominal|, m/s
+    - `intervention` |action - nominal|, m/s, see `correction`
     """
 
     action: Float[Array, "2 *lanes"]
@@ -147,16 +147,24 @@ def decide(
         circle=scenario.action == "heading",
     )
     status = jnp.where(everything, projection.status, Status.INVALID).astype(projection.status.dtype)
-    turned, sped = (
-        new - jnp.where(finite, old, 0.0) for new, old in zip(projection.action, nominal, strict=True)
-    )
     return ShieldResult(
         action=projection.action,
         status=status,
         barriers=jnp.where(known, rows.values, -jnp.inf),
         slack=projection.slack,
-        intervention=root(turned * turned + sped * sped),
+        intervention=correction(projection.action, jnp.where(finite, nominal, 0.0)),
     )
+
+
+def correction(
+    action: Float[AnyArray, "2 *lanes"], nominal: Float[AnyArray, "2 *lanes"]
+) -> Float[Array, "*lanes"]:
+    """|action - nominal| in m/s, for components of `nominal` up to 1e15 m/s; larger ones count as that.
+
+    Beyond, the square of a command, and so every sum of corrections, would be infinite.
+    """
+    x, y = (new - jnp.clip(old, -1e15, 1e15) for new, old in zip(action, nominal, strict=True))
+    return root(x * x + y * y)
 
 
 def _with_obstacles(

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, select
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.pursuit import without_answer
 from sidestep.safety import Status, start_in_lanes
 from sidestep.trials.intervention_map import add_periods, no_periods
 from sidestep.trials.keys import episode_key, start_and_pursuit
@@ -33,6 +34,7 @@ COLLECTED = (
     "interventions",
     "infeasible",
     "invalid",
+    "pursuer_invalid",
     "correction",
     "max_correction",
 )
@@ -53,6 +55,7 @@ class Episode(eqx.Module):
     interventions: Int[Array, "batch"]
     infeasible: Int[Array, "batch"]
     invalid: Int[Array, "batch"]
+    pursuer_invalid: Int[Array, "batch"]
     correction: Float[Array, "batch"]
     max_correction: Float[Array, "batch"]
 
@@ -79,6 +82,7 @@ def _begin(shield: Any, numbers: Int[Array, "batch"], worlds: World) -> Episode:
         interventions=none,
         infeasible=none,
         invalid=none,
+        pursuer_invalid=none,
         correction=zero,
         max_correction=zero,
     )
@@ -119,7 +123,7 @@ def _advance(
     def period(episode: Episode, sums: Sums, nominal: Array) -> tuple[Episode, Sums]:
         keys = jax.vmap(period_key)(episode.number, episode.steps)
         running = episode.outcome == RUNNING
-        world, memory, events, result, _ = control_step(
+        world, memory, events, result, wheels = control_step(
             scenario, shield, pursuer, episode.world.set_apart(~running), episode.memory, nominal, keys
         )
         if sums is not None:
@@ -136,6 +140,7 @@ def _advance(
             interventions=episode.interventions + (result.status != Status.OK).astype(jnp.int32),
             infeasible=episode.infeasible + (result.status == Status.INFEASIBLE).astype(jnp.int32),
             invalid=episode.invalid + (result.status == Status.INVALID).astype(jnp.int32),
+            pursuer_invalid=episode.pursuer_invalid + without_answer(wheels).astype(jnp.int32),
             correction=episode.correction + result.intervention,
             max_correction=jnp.maximum(episode.max_correction, result.intervention),
         )

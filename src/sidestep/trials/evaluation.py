@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.learning.records import OUTCOMES, json_safe
+from sidestep.learning.records import OUTCOMES
+from sidestep.store.files import json_safe
 from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.statistics import wilson_interval
 
@@ -23,7 +24,9 @@ class Evaluation:
     `times` s; `min_pursuer_clearance` and `min_obstacle_clearance` m, infinite without such a robot;
     `interventions`, `infeasible`, `invalid` control periods in which the shield did not answer with the
     nominal action, could not satisfy its rows, was given numbers that are not finite; `mean_correction`
-    over all periods and `max_correction`, m/s; `map` where the shield stepped in, if it was asked for.
+    over all periods and `max_correction`, m/s; `map` where the shield stepped in, if it was asked for;
+    `pursuer_invalid` control periods in which a pursuer answered with wheel speeds that are not finite, and
+    stood still (None: recorded before they were counted).
     """
 
     outcome: Int[np.ndarray, "episodes"]
@@ -38,6 +41,7 @@ class Evaluation:
     mean_correction: Float[np.ndarray, "episodes"]
     max_correction: Float[np.ndarray, "episodes"]
     map: InterventionMap | None = None
+    pursuer_invalid: Int[np.ndarray, "episodes"] | None = None
 
     def numbers_of(self, outcome: str) -> Int[np.ndarray, "some"]:
         """Numbers of the episodes with this outcome; `rollout` with `episode_key` replays them."""
@@ -135,6 +139,10 @@ class Evaluation:
             "intervention_rate": self.intervention_rate,
             "infeasible_rate": self.infeasible_rate,
             "invalid_rate": self.invalid_rate,
+            "pursuer_invalid": None if self.pursuer_invalid is None else int(self.pursuer_invalid.sum()),
+            "pursuer_invalid_episodes": None
+            if self.pursuer_invalid is None
+            else int(np.count_nonzero(self.pursuer_invalid)),
             "mean_correction": float(np.sum(self.mean_correction * self.steps) / np.sum(self.steps)),
             "max_correction": float(np.max(self.max_correction)),
         }

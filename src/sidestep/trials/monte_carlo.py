@@ -58,9 +58,10 @@ def evaluate(
       if not given. One where an accelerator computes, or a policy or pursuer runs on the host
 
     **Raises** `ValueError` for a number that is not positive, for an unknown name and for an answer of the
-    wrong shape. An action that is not finite is passed on to the shield and counted as `invalid`.
+    wrong shape. An action that is not finite is passed on to the shield and counted as `invalid`;
+    a pursuer whose wheel speeds are not finite stands still, which is counted as `pursuer_invalid`.
     """
-    episodes, batch = whole_number("episodes", episodes), whole_number("batch", batch)
+    episodes, batch = whole_number("episodes", episodes), whole_number("batch", batch, most=2**20)
     policy, pursuer = as_policy(policy, scenario), as_pursuer(pursuer)
     decision_steps_of(policy)
     # Someone's code on the host would only be waited for by several threads.
@@ -109,4 +110,5 @@ def _evaluation(
         mean_correction=results["correction"] / steps,
         max_correction=results["max_correction"],
         map=where,
+        pursuer_invalid=results["pursuer_invalid"],
     )

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 import sidestep
+from sidestep._arrays import seed_number, whole_number
 from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import SHIELDS, Status, make_shield
+from sidestep.store.files import json_safe, read_json, write_json
 from sidestep.trials.captures import examine_captures
 from sidestep.trials.keys import evaluation_seed
 from sidestep.trials.monte_carlo import evaluate
@@ -65,7 +67,7 @@ class ShieldStudy:
 def describe(trajectory: Trajectory) -> dict[str, Any]:
     """A recorded episode in a few figures: outcome, time (s), clearances (m), corrections (m/s)."""
     events, status = trajectory.events, np.asarray(trajectory.status)
-    return records.json_safe(
+    return json_safe(
         {
             "outcome": trajectory.outcome,
             # The clock of a long episode has gathered rounding; its first tick has not.
@@ -76,6 +78,7 @@ def describe(trajectory: Trajectory) -> dict[str, Any]:
             "intervention_rate": float(np.mean(status != Status.OK)),
             "infeasible_rate": float(np.mean(status == Status.INFEASIBLE)),
             "mean_correction": float(trajectory.intervention.mean()),
+            "pursuer_invalid": trajectory.pursuer_invalid,
         }
     )
 
@@ -98,8 +101,8 @@ def _quiet(label: str) -> AbstractContextManager[Callable[..., None]]:
 
 def _measured(path: Path, run: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     if not path.exists():
-        records.write_json(path, run())
-    return records.read_json(path)
+        write_json(path, run())
+    return read_json(path)
 
 
 def _recorded(path: Path, run: Callable[[], Trajectory]) -> Trajectory:
@@ -133,6 +136,8 @@ def reproduce(
     """
     scenario = load_scenario("paper") if scenario is None else scenario
     options = make_options() if options is None else options
+    seed_number(seed), whole_number("episodes", episodes)
+    whole_number("evaluation_episodes", evaluation_episodes)
     make_pursuer(pursuer)
     for shield in shields:
         make_shield(shield, scenario)
@@ -151,7 +156,7 @@ def reproduce(
         "version": sidestep.__version__,
     }
     if resume and (out / "config.json").exists():
-        if records.open_run(out) != records.json_safe(config):
+        if records.open_run(out) != json_safe(config):
             raise records.RunError(f"{out} was begun with other settings; use the same, or another --out")
     else:
         records.create_run(out, config)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import operator
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from sidestep._arrays import whole_number
 from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
-from sidestep.learning.records import OUTCOMES, json_safe, write_bytes
+from sidestep.learning.records import OUTCOMES
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, as_shield
+from sidestep.store.files import json_safe, write_bytes
 from sidestep.trials.keys import as_key, start_and_pursuit
 from sidestep.trials.policies import as_policy
 from sidestep.world import Events, Scenario, World, load_scenario, scenario_to_dict
@@ -33,8 +34,9 @@ class Trajectory(eqx.Module):
     """One episode of T control periods. Period t begins in world t and ends in world t + 1.
 
     **Attributes:** `worlds` with a leading axis of T + 1; the rest with one of T: `nominal` and `action`
-    velocities (m/s, world axes), `wheel_speeds` (m, 2) m/s as the pursuers asked for them, `status` (see
-    `Status`), `barriers` (m + k) in m, `slack` and `intervention` in m/s, `events`.
+    velocities (m/s, world axes), `wheel_speeds` (m, 2) m/s as the pursuers asked for them (they stood still
+    where these are not finite), `status` (see `Status`), `barriers` (m + k) in m, `slack` and `intervention`
+    in m/s, `events`.
     """
 
     worlds: World
@@ -51,6 +53,11 @@ class Trajectory(eqx.Module):
     def length(self) -> int:
         """Control periods T."""
         return int(self.status.shape[0])
+
+    @property
+    def pursuer_invalid(self) -> int:
+        """Control periods in which a pursuer answered with wheel speeds that are not finite."""
+        return int(np.sum(~np.all(np.isfinite(self.wheel_speeds), axis=(-2, -1))))
 
     @property
     def outcome(self) -> str:
@@ -138,9 +145,7 @@ def rollout(
 
     **Raises** as `evaluate`.
     """
-    steps = scenario.episode_steps if steps is None else operator.index(steps)
-    if steps < 1:
-        raise ValueError(f"steps = {steps!r}: it must be a whole number of at least 1")
+    steps = scenario.episode_steps if steps is None else whole_number("steps", steps)
     policy = as_policy(policy, scenario)
     shield = as_shield(shield, scenario)
     pursuer = as_pursuer(pursuer)

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from sidestep.learning import load_policy
-from sidestep.learning.records import OUTCOMES, RunError, open_run, read_json, write_bytes
+from sidestep.learning.records import OUTCOMES, RunError, open_run
+from sidestep.store.files import read_json, write_bytes
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.keys import episode_key, evaluation_seed
@@ -136,14 +137,12 @@ def save_survey(folder: str | Path, survey: Survey) -> None:
     """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all."""
     folder = Path(folder)
     scenario, about = _told(folder)
-    if survey.worst:
-        (folder / WORST_FOLDER).mkdir(exist_ok=True)
     for episode in survey.worst:
         save_trajectory(_worst_path(folder, episode.number), episode.trajectory, scenario, about)
     arrays: dict[str, Any] = {
         entry.name: getattr(survey.evaluation, entry.name)
         for entry in dataclasses.fields(Evaluation)
-        if entry.name != "map"
+        if entry.name != "map" and getattr(survey.evaluation, entry.name) is not None
     }
     if survey.evaluation.map is not None:
         arrays |= {_MAP + name: values for name, values in survey.evaluation.map.to_arrays().items()}

@@ -10,8 +10,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import sidestep
-from sidestep.learning.records import write_bytes
 from sidestep.safety import Status
+from sidestep.store.files import write_bytes
 from sidestep.trials import Trajectory
 from sidestep.views.html import data_uri, shown_number, shown_value
 from sidestep.views.style import OUTCOME_WORDS
@@ -60,7 +60,6 @@ def write_episode_report(
         loader=PackageLoader("sidestep.views"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, environment.get_template("episode.html").render(content).encode())
     return path
 
@@ -81,4 +80,7 @@ def _cards(trajectory: Trajectory) -> list[tuple[str, str, str]]:
     cards.append(("Largest correction", shown_number(float(np.max(changed)), 3), "m/s"))
     lost = 100.0 * float(np.mean(status >= Status.INFEASIBLE))
     cards.append(("Rows that could not hold", shown_number(lost, 1), "% of the control periods"))
+    if trajectory.pursuer_invalid:
+        still = str(trajectory.pursuer_invalid)
+        cards.append(("Pursuer's wheel speeds not finite", still, "control periods: it stood still"))
     return cards

@@ -35,4 +35,6 @@ def pooled_evaluation(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     weight = sum(report[counted] for report in reports)
     for name in _SHARES:
         pooled[name] = sum(report[name] * report[counted] for report in reports) / weight
+    unanswered = [report.get("pursuer_invalid") for report in reports]
+    pooled["pursuer_invalid"] = sum(count or 0 for count in unanswered)
     return pooled

@@ -12,8 +12,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import sidestep
-from sidestep.learning.records import write_bytes
 from sidestep.pursuit import CaptureGame
+from sidestep.store.files import write_bytes
 from sidestep.views.html import shown_number, shown_value
 from sidestep.views.pooling import pooled_evaluation
 from sidestep.views.report_sections import (
@@ -69,7 +69,6 @@ def write_report(
         lstrip_blocks=True,
     )  # fmt: skip
     html = environment.get_template("report.html").render(content)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, html.encode())
     return path
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sidestep.learning.records import RunError, read_json, read_metrics, summarise
+from sidestep.learning.records import RunError, read_metrics, summarise
 from sidestep.safety.catalogue import SHIELDS
+from sidestep.store.files import read_json
 from sidestep.trials import Survey, Trajectory, load_survey, load_trajectory
 from sidestep.world import Scenario, load_scenario
 

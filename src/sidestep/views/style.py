@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sidestep.learning.records import write_bytes
+from sidestep.store.files import write_bytes
 
 # Okabe and Ito's palette, "Color universal design" (2008).
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -137,15 +137,19 @@ def panel_titles(axes: Sequence[Axes], titles: Sequence[str], *, in_caption: boo
         text.set_gid(_CAPTION if in_caption else None)
 
 
+def figure_files(path: str | Path) -> tuple[Path, Path]:
+    """The files that `save` writes: PNG, and PDF beside it."""
+    path = Path(path)
+    return path.with_suffix(".png"), path.with_suffix(".pdf")
+
+
 def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
     """Write the figure as PNG and as PDF beside it; the suffix of `path`, if any, is replaced.
 
     The same figure gives the same bytes: no dates inside. A PNG is made coarser until it stays below 300 kB.
     The PDF drops into a two-column paper: fonts embedded as TrueType, titles that its caption gives left out.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
+    png, pdf = figure_files(path)
     content = b""
     for dpi in (_DPI, 160, 130, 100, 75):
         content = _as_png(figure, dpi)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain, islice, repeat
@@ -13,7 +12,8 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import UInt8
 
-from sidestep.learning.records import whole_file
+from sidestep.store.files import whole_file
+from sidestep.store.outputs import try_outputs
 
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
 
@@ -34,20 +34,17 @@ class VideoError(ValueError):
 def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
     """The path, if a video can be written there: asked before any work is done.
 
-    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot
-    be written to, for a file that exists unless `overwrite`, and when the package that writes it is not
-    installed.
+    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, and when the package that writes it
+    is not installed; `OutputError` for a folder or a place that cannot be written to, and for a file that
+    exists unless `overwrite`.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise VideoError(f"{path} must end in one of {', '.join(SUFFIXES)}: it says what to write")
-    if path.is_dir():
-        raise VideoError(f"{path} is a folder; give the video a name in it")
-    folder = next(folder for folder in path.absolute().parents if folder.exists())
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):
-        raise VideoError(f"{path} cannot be written: {folder} is no folder that one can write to")
-    if path.exists() and not overwrite:
-        raise VideoError(f"{path} exists already; give the video another name")
+    if overwrite:
+        try_outputs(files=[path])
+    else:
+        try_outputs(new=[path])
     if path.suffix.lower() == ".mp4":
         load_av()
     else:
@@ -106,7 +103,6 @@ def write_video_file(
     first = next(stream, None)
     if first is None:
         raise VideoError("no picture, no video")
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         if path.suffix.lower() == ".mp4":
             _write_mp4(beside, chain([first], stream), first.shape[:2], rate, hold)

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sidestep import _interrupts
-from sidestep.bridges.campaigns.cluster import LOCAL, check_options, connected, name_of
+from sidestep.bridges.campaigns.cluster import LOCAL, check_main_guard, check_options, connected, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
 from sidestep.bridges.packages import needed
+from sidestep.store.files import OutputError
 
 if TYPE_CHECKING:
     from sidestep.trials.campaign import Campaign, Job, Task
@@ -93,8 +94,9 @@ def run_campaign(
     and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
     place of `run_task`.
 
-    **Raises** `ValueError` when another call works on the folder, when it holds something else, when no
-    scheduler answers, and for bad options; and when the extra `cluster` is missing.
+    **Raises** `ValueError` when a script calls it without a main guard, when another call works on this folder,
+    when it holds something else, when no scheduler answers, and for bad options; and when the extra `cluster`
+    is missing. `OutputError` when the folder's disk is full; what is in it stays, and the next call goes on.
     """
     from sidestep.bridges.campaigns.table import write_table
     from sidestep.trials.campaign import Store, campaign_rows
@@ -102,12 +104,15 @@ def run_campaign(
     for package in ("distributed", "pyarrow"):
         needed(package, "cluster", "campaigns need")
     check_options(scheduler, workers, threads_per_worker)
+    if scheduler == LOCAL:
+        check_main_guard()
     store = Store(folder)
     with store.alone():
         store.begin(campaign.name, campaign.text)
         todo = [job for job in campaign.jobs if store.read(job.id) is None]
         outcome = CampaignOutcome(len(campaign.jobs), len(campaign.jobs) - len(todo))
         begun = time.monotonic()
+        problem: OutputError | None = None
         try:
             if todo:
                 with connected(scheduler, workers, threads_per_worker) as client:
@@ -117,13 +122,21 @@ def run_campaign(
             outcome.stopped = "interrupted"
         except SchedulerLostError:
             outcome.stopped = f"the scheduler at {name_of(scheduler)} is gone"
+        except OutputError as error:
+            problem = error
         finally:
             outcome.seconds = time.monotonic() - begun
             outcome.damaged = store.damaged()
             outcome.rows = campaign_rows(campaign.jobs, store)
             # Also what workers put there after the command had lost them.
             outcome.ran = len(outcome.rows) - outcome.earlier
-            write_table(store.folder / "results.parquet", outcome.rows)
+            try:
+                write_table(store.folder / "results.parquet", outcome.rows)
+            except OutputError as error:
+                problem = problem or error
+        if problem is not None:
+            kept = f"Kept: the results of {outcome.done} of {outcome.jobs} jobs in {store.folder}"
+            raise problem.and_kept(kept) from problem.__cause__
     return outcome
 
 
@@ -265,6 +278,9 @@ class _Dispatch:
         if isinstance(error, KilledWorker):
             self.died(future, job)
             return
+        if isinstance(error, OutputError) and error.full:
+            # All write into the same folder.
+            raise error
         del self.at_work[future]
         self.outcome.failed.append(Failure(job, f"{type(error).__name__}: {error}"))
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import logging
+import multiprocessing
 import socket
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from sidestep._compiled import cores
@@ -41,6 +46,36 @@ def check_options(scheduler: Any, workers: int | None, threads: int | None) -> N
         raise ValueError(
             "--workers and --threads-per-worker are for --scheduler local; a cluster has its own"
         )
+
+
+def check_main_guard() -> None:
+    """**Raises** `ValueError` in a script that the local workers, which import it, would run once more."""
+    main = sys.modules.get("__main__")
+    file, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
+    # What multiprocessing does not import in a child: a prompt, `python -c`, `python -m package`.
+    if file is None or (spec is not None and spec.name.endswith(".__main__")):
+        return
+    if getattr(multiprocessing.current_process(), "_inheriting", False) or not _is_guarded(file):
+        raise ValueError(
+            f"workers on this machine import {file}, which would start the campaign again in each: put "
+            'the call under `if __name__ == "__main__":`, or in a function that is called there'
+        )
+
+
+def _is_guarded(file: str) -> bool:
+    """Whether the statement of the main script that is running now stands under a test of `__name__`."""
+    frame, line = inspect.currentframe(), None
+    while frame is not None:
+        if frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") == "__main__":
+            line = frame.f_lineno
+        frame = frame.f_back
+    try:
+        statements = ast.parse(Path(file).read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return True
+    # Called in a thread, or by what is no Python file: nobody can tell.
+    here = [one for one in statements if line is not None and one.lineno <= line <= (one.end_lineno or 0)]
+    return all(isinstance(one, ast.If) and "__name__" in ast.dump(one.test) for one in here)
 
 
 def name_of(scheduler: Any) -> str:

@@ -17,14 +17,13 @@ def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
     **Raises** `ValueError` when pyarrow (extra `cluster`) is missing.
     """
-    from sidestep.learning.records import whole_file
+    from sidestep.store.files import whole_file
 
     arrow: Any = needed("pyarrow", "cluster", "campaign tables need")
     parquet: Any = needed("pyarrow.parquet", "cluster", "campaign tables need")
     path = Path(path)
     names = list(dict.fromkeys(name for row in rows for name in row))
     columns = {name: _column(arrow, [_plain(row.get(name)) for row in rows]) for name in names}
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         parquet.write_table(arrow.table(columns), beside)
     return path

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import sidestep
-from sidestep.learning.records import write_bytes
+from sidestep.store.files import write_bytes
 from sidestep.world import Scenario
 from sidestep.world.loading import scenario_to_dict
 
@@ -22,7 +22,6 @@ def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:
     path = Path(path)
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists already; give another file, or --overwrite to replace it")
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, content)
     return path
 

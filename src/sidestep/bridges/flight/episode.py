@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep import _interrupts
+from sidestep._arrays import seed_number
 from sidestep.bridges.flight.flight import Flight
 from sidestep.bridges.flight.options import FlightOptions, budget_of, check_scenario, errors_of
 from sidestep.bridges.onboard import Onboard, OnboardSettings
@@ -184,6 +185,7 @@ def fly(
     scenario, options = pilot.scenario, pilot.options
     limit = periods_of(scenario, steps)
     strategy = as_pursuer(pursuer)
+    seed_number(seed)
     flight = Flight(scenario, options, seed)
     drawn, key = start_of(scenario, jnp.asarray(seed, jnp.uint32))
     flight.reset(drawn if world is None else world)

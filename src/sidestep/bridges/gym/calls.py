@@ -76,7 +76,7 @@ def flat(function: Callable[..., Any], *layouts: Any) -> Callable[..., Any]:
     return program
 
 
-def packed(made: Decision) -> tuple[Float[Array, "8 *lanes"], Int[Array, "*lanes"]]:
+def packed(made: Decision) -> tuple[Float[Array, "9 *lanes"], Int[Array, "*lanes"]]:
     """A decision as two arrays: each array that crosses over to NumPy costs some microseconds."""
     floats = jnp.stack(
         [
@@ -86,6 +86,7 @@ def packed(made: Decision) -> tuple[Float[Array, "8 *lanes"], Int[Array, "*lanes
             *made.executed,
             made.pursuer_clearance,
             made.obstacle_clearance,
+            made.pursuer_invalid.astype(made.reward.dtype),
         ]
     )
     whole = made.status.astype(jnp.int32) * 2 ** len(FLAGS) + made.periods.astype(jnp.int32) * _PERIODS
@@ -108,6 +109,7 @@ def unpacked(floats: Any, whole: Any) -> tuple[Any, dict[str, Any]]:
         "executed": np.moveaxis(floats[4:6], 0, -1),
         "pursuer_clearance": floats[6],
         "obstacle_clearance": floats[7],
+        "pursuer_invalid": floats[8].astype(int),
     }
 
 
@@ -122,6 +124,7 @@ def unpacked_one(floats: Any, whole: Any) -> tuple[float, bool, bool, dict[str, 
 
 
 def seed_words(seeds: Any) -> np.ndarray:
-    """The words (2, n) of the random keys with these seeds: `jax.random.key(seed)`'s, below 2^32."""
+    """The words (2, n) of the random keys with these seeds: `jax.random.key(seed)`'s, below 2^32. Larger ones
+    are Gymnasium's own, drawn where none was given."""
     seeds = [int(seed) % 2**64 for seed in seeds]
     return np.array([[seed >> 32 for seed in seeds], [seed % 2**32 for seed in seeds]], np.uint32)

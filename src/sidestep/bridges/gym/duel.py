@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from jaxtyping import Array, Float
 
+from sidestep._arrays import seed_number
 from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
@@ -186,6 +187,8 @@ class DuelEnv(pettingzoo.ParallelEnv):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        if seed is not None:
+            seed_number(seed)
         if seed is not None or self._number < 0:
             seed = seeding.np_random()[1] if seed is None else seed
             self._words, self._number = seed_words([seed])[:, 0], -1

@@ -9,6 +9,7 @@ import gymnasium
 import jax
 import numpy as np
 
+from sidestep._arrays import seed_number
 from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
@@ -118,6 +119,8 @@ class PursuedEnv(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         told = checked_options(options, "world")
+        if seed is not None:
+            seed_number(seed)
         super().reset(seed=seed)
         if seed is not None or self._number < 0:
             self._words, self._number = seed_words([self.np_random_seed])[:, 0], -1

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from sidestep._arrays import AnyArray, Lanes, lane_by_lane, real, select
 from sidestep.bridges.gym.task import Task
 from sidestep.learning.control_step import control_step, nominal_velocity
+from sidestep.pursuit import without_answer
 from sidestep.safety import start_in_lanes
 from sidestep.trials.keys import episode_key, start_and_pursuit
 from sidestep.world import World, observe, to_action
@@ -41,7 +42,7 @@ class Decision(eqx.Module):
 
     **Attributes:** `reward` summed; the flags of `Events`; the worst `status`; `intervention` (m/s, mean);
     `proposed` and `executed` (mean) in the policy's units and axes; the least clearances (m); `periods`
-    lived through.
+    lived through, and `pursuer_invalid` those of them in which a pursuer's wheel speeds were not finite.
     """
 
     reward: Lanes
@@ -56,6 +57,7 @@ class Decision(eqx.Module):
     pursuer_clearance: Lanes
     obstacle_clearance: Lanes
     periods: Int[Array, "*lanes"]
+    pursuer_invalid: Int[Array, "*lanes"]
 
     @property
     def ended(self) -> Bool[Array, "*lanes"]:
@@ -98,7 +100,7 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
     def period(episode: Episode, apart: Any) -> tuple[Episode, Decision]:
         key = lane_by_lane(jax.random.fold_in, start.lanes, keys, episode.periods)
         world = episode.world if apart is None else episode.world.set_apart(apart)
-        world, memory, events, result, _ = control_step(
+        world, memory, events, result, wheels = control_step(
             scenario, task.shield, task.pursuer, world, episode.memory, nominal, key
         )
         moved = Episode(world, memory, episode.words, episode.number, episode.periods + 1)
@@ -115,6 +117,7 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
             pursuer_clearance=events.pursuer_clearance,
             obstacle_clearance=events.obstacle_clearance,
             periods=jnp.ones_like(moved.periods),
+            pursuer_invalid=without_answer(wheels).astype(moved.periods.dtype),
         )
 
     def another(carry: tuple[Episode, Decision], _: None) -> tuple[tuple[Episode, Decision], None]:
@@ -133,6 +136,7 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
             pursuer_clearance=jnp.minimum(so_far.pursuer_clearance, now.pursuer_clearance),
             obstacle_clearance=jnp.minimum(so_far.obstacle_clearance, now.obstacle_clearance),
             periods=so_far.periods + 1,
+            pursuer_invalid=so_far.pursuer_invalid + now.pursuer_invalid,
         )
         return select(over, carry, (moved, joined)), None
 

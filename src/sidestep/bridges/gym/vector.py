@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Float
 
-from sidestep._arrays import whole_number
+from sidestep._arrays import seed_number, whole_number
 from sidestep._threads import useful_threads
 from sidestep.bridges.gym.calls import seed_words, unpacked
 from sidestep.bridges.gym.fleet import AHEAD
@@ -171,6 +171,12 @@ class PursuedVectorEnv(VectorEnv):
         """Take new seeds; which worlds got one."""
         if seed is None and not self._launched:
             seed = self.np_random_seed
+        elif isinstance(seed, (int, np.integer)):
+            seed_number(seed)
+            seed_number(int(seed) + self.num_envs - 1, "the seed of the last world")
+        elif seed is not None:
+            for one in seed:
+                seed_number(0 if one is None else one)
         if seed is None:
             return np.zeros(self.num_envs, bool)
         if isinstance(seed, (int, np.integer)):

@@ -15,8 +15,9 @@ import numpy as np
 
 from sidestep.bridges.logs.messages import heading_of
 from sidestep.bridges.logs.reader import Record, about_of, read_log
-from sidestep.bridges.logs.writer import LogWriter
+from sidestep.bridges.logs.writer import LogWriter, refuse_existing
 from sidestep.safety import Status
+from sidestep.store.files import whole_file
 from sidestep.trials import Trajectory
 from sidestep.world import Events, Scenario, World, load_scenario
 from sidestep.world.state import WORLD_FIELDS, worlds_of
@@ -58,13 +59,14 @@ def save_log(
     **Arguments:** `about` what else is to be known (shield, policy, pursuer, seed, source); `levels` per
     period and `reactions` (time in s, text) of the decision core, if it was one.
 
-    **Raises** as `LogWriter`.
+    **Raises** as `LogWriter`. Whatever happens, no part of a file is left.
     """
     worlds = _host(trajectory.worlds)
     # On the host at once: an entry at a time JAX would take a second per thousand.
     told = jax.tree.map(np.asarray, eqx.tree_at(lambda t: t.worlds, trajectory, None))
     times = worlds["time"].tolist()
-    with LogWriter(path, scenario, about, overwrite=overwrite) as log:
+    refuse_existing(path, overwrite)
+    with whole_file(path) as beside, LogWriter(beside, scenario, about) as log:
         for period, stamp in enumerate(times):
             _write_world(log, stamp, {name: values[period] for name, values in worlds.items()})
             if period == trajectory.length:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,8 +14,8 @@ import sidestep
 from sidestep._arrays import AnyArray
 from sidestep.bridges.logs import messages
 from sidestep.bridges.packages import needed
-from sidestep.learning.records import json_safe
 from sidestep.safety import Status
+from sidestep.store.files import OutputError, is_stream, json_safe, writing
 from sidestep.world import Scenario
 from sidestep.world.loading import scenario_to_dict
 
@@ -38,7 +39,8 @@ class LogWriter:
     **Arguments:** `scenario` and `about` (what else is to be known: shield, policy, pursuer, seed, source)
     are stored at the very beginning.
 
-    **Raises** `ValueError` where `path` exists and `overwrite` is not set, or mcap is not installed.
+    **Raises** `ValueError` where `path` exists and `overwrite` is not set, or mcap is not installed, and
+    `OutputError`, a `ValueError` too, whenever the system refuses to write.
     """
 
     def __init__(
@@ -52,12 +54,11 @@ class LogWriter:
     ):
         ros2 = needed("mcap_ros2.writer", "logs", "logs need")
         self.path = Path(path)
-        if self.path.exists() and not overwrite:
-            raise ValueError(f"{self.path} exists already; give the log another name")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        refuse_existing(path, overwrite)
         self._frame = frame
-        self._file = open(self.path, "wb")  # noqa: SIM115
-        self._writer = ros2.Writer(self._file, chunk_size=_CHUNK)
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self.path, "wb")  # noqa: SIM115
         self._schemas: dict[str, Any] = {}
         self._counts: dict[str, int] = {}
         record = {
@@ -65,19 +66,43 @@ class LogWriter:
             "scenario": json.dumps(scenario_to_dict(scenario)),
             "about": json.dumps(json_safe(about or {})),
         }
-        self._writer.add_metadata(METADATA, record)
-        self._file.flush()
+        try:
+            with writing(self.path):
+                self._writer = ros2.Writer(self._file, chunk_size=_CHUNK)
+                self._writer.add_metadata(METADATA, record)
+                self._file.flush()
+        except BaseException:
+            self._give_up()
+            if not is_stream(self.path):
+                self.path.unlink(missing_ok=True)
+            raise
 
     def __enter__(self) -> LogWriter:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        try:
+            self.close()
+        except OutputError:
+            # What went wrong first is said.
+            if error[0] is None:
+                raise
 
     def close(self) -> None:
         """Write the index that lets readers jump, and close the file; once is enough."""
-        if not self._file.closed:
-            self._writer.finish()
+        if self._file.closed:
+            return
+        try:
+            with writing(self.path):
+                self._writer.finish()
+                self._file.close()
+        except OutputError:
+            self._give_up()
+            raise
+
+    def _give_up(self) -> None:
+        # Closing tries once more to write what could not be written, and closes all the same.
+        with contextlib.suppress(OSError):
             self._file.close()
 
     def write(self, topic: str, kind: str, stamp: float, message: Mapping[str, Any]) -> None:
@@ -86,11 +111,12 @@ class LogWriter:
             self._schemas[kind] = self._writer.register_msgdef(kind, messages.definition(kind))
         count = self._counts.get(topic, 0)
         self._counts[topic] = count + 1
-        self._writer.write_message(
-            topic, self._schemas[kind], message, log_time=messages.nanoseconds(stamp), sequence=count
-        )
-        # A chunk that is complete is the operating system's business, whatever becomes of us.
-        self._file.flush()
+        with writing(self.path):
+            self._writer.write_message(
+                topic, self._schemas[kind], message, log_time=messages.nanoseconds(stamp), sequence=count
+            )
+            # A chunk that is complete is the operating system's business, whatever becomes of us.
+            self._file.flush()
 
     def pose(
         self,
@@ -205,6 +231,12 @@ class LogWriter:
     def _twist(self, topic: str, stamp: float, velocity: Numbers) -> None:
         vx, vy = _plain(velocity)
         self.write(topic, messages.TWIST, stamp, messages.twist(stamp, vx, vy, self._frame))
+
+
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """**Raises** `ValueError` where there is a file that is not to be written over."""
+    if Path(path).exists() and not overwrite and not is_stream(path):
+        raise ValueError(f"{path} exists already; give the log another name")
 
 
 def _plain(values: Numbers) -> list[float]:

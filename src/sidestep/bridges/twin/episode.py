@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep import _interrupts
+from sidestep._arrays import seed_number
 from sidestep.bridges.onboard import Onboard, OnboardSettings
 from sidestep.bridges.twin.options import TwinOptions
 from sidestep.bridges.twin.record import (
@@ -112,6 +113,7 @@ def twin_episode(
     scenario = onboard.scenario
     limit = periods_of(scenario, steps)
     strategy = as_pursuer(pursuer)
+    seed_number(seed)
     twin = Twin(scenario, options, seed)
     drawn, key = start_of(scenario, jnp.asarray(seed, jnp.uint32))
     twin.reset(drawn if world is None else world)

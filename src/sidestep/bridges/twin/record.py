@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sidestep._arrays import whole_number
 from sidestep.bridges.onboard import Decision
 from sidestep.bridges.twin.contacts import Contacts
 from sidestep.pursuit import Pursuer, pursue
@@ -66,6 +66,7 @@ class PhysicsEpisode:
             "least_obstacle_distance": _finite(self.least_obstacle_distance),
             "infeasible_periods": int(np.sum(status == Status.INFEASIBLE)),
             "periods": self.trajectory.length,
+            "pursuer_invalid": self.trajectory.pursuer_invalid,
             "periods_not_normal": sum(level != "normal" for level in self.levels),
             "reactions": sorted({text for _, text in self.reactions}),
             "estimate_error_p99": float(np.quantile(self.estimate_errors, 0.99)),
@@ -81,10 +82,7 @@ def _finite(distance: float) -> float | None:
 
 def periods_of(scenario: Scenario, steps: int | None) -> int:
     """How many control periods to play at most. **Raises** `ValueError` for fewer than one."""
-    limit = scenario.episode_steps if steps is None else operator.index(steps)
-    if limit < 1:
-        raise ValueError(f"steps = {steps!r}: it must be a whole number of at least 1")
-    return limit
+    return scenario.episode_steps if steps is None else whole_number("steps", steps)
 
 
 @eqx.filter_jit

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.learning.records import json_safe, summarise
+from sidestep.learning.records import summarise
+from sidestep.store.files import json_safe
 
 KINDS = ("evaluate", "train")
 AXES = ("scenario", "shield", "pursuer", "policy", "learner", "seed")

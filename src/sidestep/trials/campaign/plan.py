@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sidestep.learning import load_policy, make_options, options_to_dict
-from sidestep.learning.records import json_safe
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield
+from sidestep.store.files import json_safe
 from sidestep.trials.campaign.jobs import AXES, KINDS, Job, digest_of_file, figure_names
 from sidestep.trials.policies import GOAL_SEEKING
 from sidestep.world import Scenario, load_scenario, scenario_to_dict

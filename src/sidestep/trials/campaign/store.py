@@ -15,7 +15,15 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from sidestep.learning.records import json_safe, read_json, sync_folder, write_bytes, write_json
+from sidestep.store.files import (
+    json_safe,
+    make_folder,
+    read_json,
+    sync_folder,
+    write_bytes,
+    write_json,
+    writing,
+)
 
 _FORMAT = 1
 _CANNOT_LINK = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
@@ -53,12 +61,11 @@ class Store:
         """
         self._refuse_what_is_not_ours()
         if self.token is None:
-            self.folder.mkdir(parents=True, exist_ok=True)
             write_json(
                 self.folder / "campaign.json", {"format": _FORMAT, "name": name, "token": uuid.uuid4().hex}
             )
         for folder in ("results", "runs", "locks"):
-            (self.folder / folder).mkdir(exist_ok=True)
+            make_folder(self.folder / folder)
         write_bytes(self.folder / "campaign.toml", text.encode())
 
     @contextmanager
@@ -68,7 +75,7 @@ class Store:
         **Raises** `ValueError` when another does, or the folder holds something else than a campaign.
         """
         self._refuse_what_is_not_ours()
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         try:
             with FileLock(self.folder / "campaign.lock", timeout=0):
                 yield
@@ -118,14 +125,16 @@ class Store:
         job = record["job"]
         path = self.path(job)
         beside = path.with_name(f".{job}.{uuid.uuid4().hex}.tmp")
-        try:
-            _write_synced(beside, _sealed(record))
-            while not _link(beside, path):
-                if self.read(job) is not None:
-                    return False
-        finally:
-            beside.unlink(missing_ok=True)
-        sync_folder(path.parent)
+        content = _sealed(record)
+        with writing(path, len(content)):
+            try:
+                _write_synced(beside, content)
+                while not _link(beside, path):
+                    if self.read(job) is not None:
+                        return False
+            finally:
+                beside.unlink(missing_ok=True)
+            sync_folder(path.parent)
         return True
 
     def jobs(self) -> set[str]:

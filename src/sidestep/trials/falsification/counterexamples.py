@@ -18,8 +18,8 @@ from jaxtyping import Float
 import sidestep
 from sidestep.learning.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.learning.policy import LearnedPolicy, load_policy
-from sidestep.learning.records import json_safe
 from sidestep.safety import SHIELDS, Shield, make_shield
+from sidestep.store.files import json_safe
 from sidestep.trials.falsification.attackers import Script
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.trials.rollout import Trajectory, rollout

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,21 @@ import numpy as np
 
 import sidestep
 from sidestep import _interrupts
+from sidestep._arrays import seed_number, whole_number
 from sidestep.learning.checkpoints import read_arrays, write_arrays
 from sidestep.learning.policy import load_policy
 from sidestep.learning.records import (
+    NOT_BEGUN,
     OUTCOMES,
     RunError,
     append_metrics,
     create_run,
-    json_safe,
     open_run,
     read_metrics,
     write_summary,
 )
 from sidestep.safety import Shield, as_shield
+from sidestep.store.files import OutputError, json_safe, make_folder
 from sidestep.trials.falsification.attacks import ATTACKS, Round, make_attack
 from sidestep.trials.falsification.chases import GOALS, Target
 from sidestep.trials.falsification.counterexamples import (
@@ -66,10 +69,9 @@ def check_plan(scenario: Scenario, plan: Plan) -> None:
         raise ValueError(f"attacks = {list(plan.attacks)}: they must be some of {', '.join(ATTACKS)}")
     if len(set(plan.attacks)) < len(plan.attacks):
         raise ValueError(f"attacks = {list(plan.attacks)}: each may be named only once")
-    for name, least in (("batch", 1), ("most", 1), ("seed", 0)):
-        value = getattr(plan, name)
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
+    for name in ("batch", "most"):
+        whole_number(name, getattr(plan, name))
+    seed_number(plan.seed)
     if not np.isfinite(plan.seconds) or plan.seconds < float(scenario.control_period):
         raise ValueError(f"seconds = {plan.seconds!r}: it must be at least one control period")
 
@@ -109,8 +111,8 @@ def falsify(
         minutes = _DEFAULT_MINUTES
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
         raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
-    if episodes is not None and (isinstance(episodes, bool) or episodes < 1):
-        raise ValueError(f"episodes = {episodes!r}: it must be a whole number of at least 1")
+    if episodes is not None:
+        whole_number("episodes", episodes)
     plan = plan or Plan()
     if resume:
         scenario, source, shield, plan = _stored(folder, policy, shield)
@@ -134,7 +136,7 @@ def falsify(
         _check_policy(folder, about["policy"])
     else:
         create_run(folder, about)
-    (folder / "counterexamples").mkdir(exist_ok=True)
+    make_folder(folder / "counterexamples")
     hunt = _Hunt(folder, target, shield_called, about, plan, progress)
     return hunt.run(minutes, episodes)
 
@@ -145,7 +147,7 @@ def _load(source: str | Path) -> Any:
 
 def _stored(folder: Path, policy: Any, shield: Any) -> tuple[Scenario, Any, Any, Plan]:
     """Scenario, policy's source, shield and plan of a search begun before."""
-    config = open_run(folder)
+    config = open_run(folder, NOT_BEGUN)
     if config.get("kind") != "falsification":
         raise RunError(
             f"{folder} holds no search for counterexamples; leave out --resume, or name its folder"
@@ -230,9 +232,21 @@ class _Hunt:
                     self.progress(Progress(name, self.tallies[name], self.tallies, self.elapsed, budget))
         except KeyboardInterrupt:
             interrupted = True
+        except OutputError as error:
+            with suppress(OutputError):
+                write_summary(self.folder, self._summary(True))
+            raise error.and_kept(self._kept()) from error.__cause__
         summary = self._summary(interrupted)
-        write_summary(self.folder, summary)
+        try:
+            write_summary(self.folder, summary)
+        except OutputError as error:
+            raise error.and_kept(self._kept()) from error.__cause__
         return Falsification(self.folder, summary, self.tallies, interrupted)
+
+    def _kept(self) -> str:
+        rounds = sum(tally.rounds for tally in self.tallies.values())
+        found = sum(len(tally.kept) for tally in self.tallies.values())
+        return f"Kept: {rounds} rounds of the search and {found} counterexamples in {self.folder}"
 
     def _round(self, name: str) -> None:
         began, tally = time.perf_counter(), self.tallies[name]
@@ -252,6 +266,7 @@ class _Hunt:
                 "captured": np.sum(result.outcome == OUTCOMES.index("captured")),
                 "collided": np.sum(result.outcome == OUTCOMES.index("collided")),
                 "unconfirmed": unconfirmed,
+                "pursuer_invalid": np.sum(~np.all(np.isfinite(result.wheels), axis=(-2, -1))),
                 **{which: np.min(getattr(result, which)) for which in LEAST},
                 "counterexamples": kept,
                 "seconds": time.perf_counter() - began,
@@ -328,6 +343,7 @@ class _Hunt:
                 "control_periods": sum(tally.control_periods for tally in self.tallies.values()),
                 "captured": sum(tally.captured for tally in self.tallies.values()),
                 "collided": sum(tally.collided for tally in self.tallies.values()),
+                "pursuer_invalid": sum(tally.pursuer_invalid for tally in self.tallies.values()),
                 "first_seconds": found[0]["at"] if found else None,
                 "kept": len(found),
                 "inside_assumptions": sum(name is None for name in assumptions),

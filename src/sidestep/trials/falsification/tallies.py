@@ -11,7 +11,16 @@ import numpy as np
 
 from sidestep.trials.falsification.attacks import ATTACKS
 
-COUNTERS = ("rounds", "episodes", "control_periods", "seconds", "captured", "collided", "unconfirmed")
+COUNTERS = (
+    "rounds",
+    "episodes",
+    "control_periods",
+    "seconds",
+    "captured",
+    "collided",
+    "unconfirmed",
+    "pursuer_invalid",
+)
 """What a `Tally` adds up over rounds."""
 LEAST = ("pursuer_clearance", "obstacle_clearance", "margin")
 """What a `Tally` keeps the least of."""
@@ -36,7 +45,8 @@ class Plan:
 
 @dataclass
 class Tally:
-    """What one attack has come to. Clearances and margin: the least, m. `first` s into the search."""
+    """What one attack has come to. Clearances and margin: the least, m. `first` s into the search;
+    `pursuer_invalid` periods in which an attack's wheel speeds were not finite."""
 
     rounds: int = 0
     episodes: int = 0
@@ -45,6 +55,7 @@ class Tally:
     captured: int = 0
     collided: int = 0
     unconfirmed: int = 0
+    pursuer_invalid: int = 0
     pursuer_clearance: float = np.inf
     obstacle_clearance: float = np.inf
     margin: float = np.inf
@@ -54,7 +65,7 @@ class Tally:
     def add(self, line: Mapping[str, Any]) -> None:
         """Count one round, as its line in `metrics.jsonl` says."""
         for name in COUNTERS:
-            setattr(self, name, getattr(self, name) + (1 if name == "rounds" else line[name]))
+            setattr(self, name, getattr(self, name) + (1 if name == "rounds" else line.get(name, 0)))
         for name in LEAST:
             value = line[name]
             setattr(self, name, min(getattr(self, name), np.inf if value is None else value))
