@@ -12,7 +12,7 @@ from sidestep.commands.common import (
     CountBar,
     Overrides,
     ShieldName,
-    parse_overrides,
+    scenario_overrides,
     write_json_file,
 )
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
@@ -74,7 +74,7 @@ def run(command: Falsify, console: Console) -> int:
     from sidestep.world import load_scenario
 
     out = command.out or Path("runs") / f"falsify-{command.shield}"
-    overrides = parse_overrides(command.set)
+    overrides = scenario_overrides(command.set)
     if command.scenario is None and (Path(command.policy) / "config.json").is_file():
         scenario = load_scenario("paper", **{**open_run(command.policy)["scenario"], **overrides})
     else:
