@@ -180,7 +180,7 @@ def _changes_table(useful: Sequence[Change], certificate: Certificate) -> Any:
 
 def _cells(changes: Sequence[Change]) -> list[str]:
     columns = [
-        (f"{'and ' if i else ''}{change.parameter}", *_values(change), _by(change), _whose(change))
+        (f"{'+ ' if i else ''}{change.parameter}", *_values(change), _by(change), _whose(change))
         for i, change in enumerate(changes)
     ]
     return ["\n".join(column) for column in zip(*columns, strict=True)]
@@ -197,4 +197,4 @@ def _by(change: Change) -> str:
 
 
 def _whose(change: Change) -> str:
-    return change.whose if change.mine else f"{change.whose}, not yours"
+    return change.whose if change.mine else "not yours"

@@ -30,10 +30,10 @@ class Certify:
     pursuer: RobotName = None
     """A pursuer that is on sale, see --robots: sets its speed and half axle."""
     evader: RobotName = None
-    """An evader that is on sale: sets its speed. With both, capture is contact: at the sum of their radii."""
+    """An evader that is on sale: sets its speed. With both, capture is contact, the sum of their radii."""
     set: Overrides = ()
-    """Scenario fields to change; pursuer_half_axle and control_period may be 0 here. wheel_separation may stand
-    for pursuer_half_axle, which is half of it."""
+    """Scenario fields to change; pursuer_half_axle and control_period may be 0 here. wheel_separation, its
+    double, may be given for pursuer_half_axle."""
     position_error: float = 0.0
     """Largest error of a measured position of the pursuer, m."""
     heading_error: float = 0.0

@@ -179,21 +179,7 @@ def certify(
 
 def _answer(situation: Situation, mine: Collection[str], tell: Callable[[str], None]) -> Certificate:
     game, wanted = situation.game, situation.capture_distance
-    limit = game.largest_capture_distance
-    tracked = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
-    exact = replace(tracked, tracking_error=0.0)
-    held = best_design(game)
-    sampled = held if exact == game else best_design(exact)
-    driven = sampled if exact == tracked else best_design(tracked)
-    levels = [0.0 if design is None else design.level for design in (sampled, driven)]
-    clearance = 0.0 if held is None else max(held.level - delay_cost(game), 0.0)
-    needed = wanted + delay_cost(game)
-    if outruns(game, needed):
-        clearance = math.inf
-    budget = _budget(game, wanted, clearance, *levels)
-    # The parts of the plain budget bound the clearance too, where they happen to be the stricter ones.
-    if math.isfinite(clearance) and math.isfinite(limit):
-        clearance = max(min(clearance, limit - budget["total"]), 0.0)
+    clearance, budget, held = clearance_of(situation)
     in_the_open = clearance >= wanted
     alone = not situation.walls and situation.pursuer_count == 1
     guaranteed = in_the_open and alone
@@ -203,6 +189,7 @@ def _answer(situation: Situation, mine: Collection[str], tell: Callable[[str], N
         tell("the nearest changes that make it hold")
         changes = nearest_changes(situation, clearance, mine)
         pairs = nearest_pairs(situation, budget, changes, mine)
+    needed = wanted + delay_cost(game)
     control, start = _sets(game, needed if in_the_open else None, held) if alone else (None, None)
     unsure = 0.0
     if held is not None and math.isfinite(held.level):
@@ -212,9 +199,9 @@ def _answer(situation: Situation, mine: Collection[str], tell: Callable[[str], N
         situation=situation,
         guaranteed=guaranteed,
         reason=_reason(situation, in_the_open),
-        pursuer_wins=wanted > limit,
+        pursuer_wins=wanted > game.largest_capture_distance,
         guaranteed_clearance=clearance if alone else 0.0,
-        largest_capture_distance=limit,
+        largest_capture_distance=game.largest_capture_distance,
         budget=budget,
         grid_error=unsure,
         nearest_changes=changes,
@@ -222,6 +209,29 @@ def _answer(situation: Situation, mine: Collection[str], tell: Callable[[str], N
         control_set=control,
         start_set=start,
     )
+
+
+def clearance_of(situation: Situation) -> tuple[float, dict[str, float], Design | None]:
+    """What an evader alone with one pursuer in the open can keep for ever (m), the budget, and what holds it.
+
+    The capture distance is guaranteed if the clearance is at least that.
+    """
+    game, wanted = situation.game, situation.capture_distance
+    limit = game.largest_capture_distance
+    tracked = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
+    exact = replace(tracked, tracking_error=0.0)
+    held = best_design(game)
+    sampled = held if exact == game else best_design(exact)
+    driven = sampled if exact == tracked else best_design(tracked)
+    levels = [0.0 if design is None else design.level for design in (sampled, driven)]
+    clearance = 0.0 if held is None else max(held.level - delay_cost(game), 0.0)
+    if outruns(game, wanted + delay_cost(game)):
+        clearance = math.inf
+    budget = _budget(game, wanted, clearance, *levels)
+    # The parts of the plain budget bound the clearance too, where they happen to be the stricter ones.
+    if math.isfinite(clearance) and math.isfinite(limit):
+        clearance = max(min(clearance, limit - budget["total"]), 0.0)
+    return clearance, budget, held
 
 
 def _budget(

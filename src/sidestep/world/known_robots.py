@@ -4,8 +4,8 @@ A figure of `known_robots.toml` becomes a number of the scenario only where the 
 (pursuers) or certainly do as much (evaders), so that what is guaranteed in the model is not too much:
 
 - A differential drive in the model takes every |v| + b|omega| <= V. Where the most that a wheel's rim makes
-  is known, V is that, at least the top speed and at least b times the top turn rate. Elsewhere both limits are
-  taken to be reached together, and V = v_max + b omega_max covers that, whatever b.
+  is known, V is that, at least the top speed and at least b times the top turn rate. Elsewhere both limits
+  are taken to be reached together, and V = v_max + b omega_max covers that, whatever b.
 - An evader in the model moves as fast in every direction. Mecanum wheels that make s straight ahead allow
   |v_x| + |v_y| <= s, so s/sqrt(2) in every direction.
 """
