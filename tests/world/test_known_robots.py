@@ -4,6 +4,7 @@ import itertools
 import math
 import tomllib
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,6 +78,15 @@ def test_any_two_make_a_scenario_whose_capture_distance_is_contact(pursuer, evad
     assert float(scenario.pursuer_half_axle) == pytest.approx(robots[pursuer].half_axle)
     assert float(scenario.evader_speed) == pytest.approx(robots[evader].speed)
     assert float(scenario.initial_separation / scenario.capture_distance) == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("name", [*PURSUERS, *EVADERS])
+def test_the_documentation_names_the_robot_with_the_numbers_that_are_used(name):
+    page = (Path(__file__).parents[2] / "docs" / "certificate.md").read_text("utf-8")
+    row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+    robot = known_robots()[name]
+    half = f"| {robot.half_axle:g} m |" if robot.role == "pursuer" else "| |"
+    assert f"= {robot.speed:.4g} m/s {half} {robot.radius:g} m |" in row
 
 
 def test_one_robot_alone_leaves_the_capture_distance_to_the_scenario():

@@ -18,28 +18,31 @@ if TYPE_CHECKING:
 def print_known_robots(console: Console) -> None:
     """Every robot of `known_robots.toml`: what the model makes of it, its figures, and where they stand."""
     from rich.markup import escape
+    from rich.table import Table
 
     from sidestep.world import known_robots
 
-    for robot in known_robots().values():
-        console.print(
-            f"[bold]{robot.name}[/bold]  {escape(robot.title)}, {_model_words(robot)}", highlight=False
-        )
-        for name, figure in robot.figures.items():
-            how = f" ({figure['how']})" if "how" in figure else ""
-            where = "; ".join(source["title"] for source in figure["sources"])
-            console.print(f"  {name} {figure['value']:g}{escape(how)}: {escape(where)}", highlight=False)
-        console.print(f"  Not known: {escape(robot.unknown)}", highlight=False)
-    console.print("\nWhere the figures stand, and what of it was read:", highlight=False)
-    for source in _sources(known_robots().values()):
-        console.print(
-            f"  {escape(source['title'])}: {source['address']} ({escape(source['read'])})", highlight=False
-        )
-
-
-def _sources(robots: Collection[KnownRobot]) -> list[dict[str, str]]:
+    robots = known_robots().values()
+    table = Table("name", "role", "speed, m/s", "b, m", "radius, m")
+    for robot in robots:
+        half = f"{robot.half_axle:g}" if robot.role == "pursuer" else ""
+        table.add_row(robot.name, robot.role, f"{robot.speed:.4g}", half, f"{robot.radius:g}")
+    table.caption = "speed: V of a pursuer's wheel rims, v_e of an evader in every direction"
+    console.print(table)
     figures = [figure for robot in robots for figure in robot.figures.values()]
-    return list({source["title"]: source for figure in figures for source in figure["sources"]}.values())
+    sources = list({source["title"]: source for figure in figures for source in figure["sources"]}.values())
+    for robot in robots:
+        console.print(f"[bold]{robot.name}[/bold]  {escape(robot.title)}", highlight=False)
+        console.print(f"  {escape(robot.reason)}", highlight=False)
+        for name, figure in robot.figures.items():
+            numbers = ", ".join(str(sources.index(source) + 1) for source in figure["sources"])
+            how = f": {figure['how']}" if "how" in figure else ""
+            console.print(escape(f"  {name} {figure['value']:g} [{numbers}]{how}"), highlight=False)
+        console.print(f"  Not known: {escape(robot.unknown)}", highlight=False)
+    console.print("[bold]Sources[/bold], and what of them was read")
+    for number, source in enumerate(sources, 1):
+        text = f"[{number}] {source['title']}\n    {source['address']}\n    {source['read']}"
+        console.print(escape(text), highlight=False, soft_wrap=True)
 
 
 def _model_words(robot: KnownRobot) -> str:
