@@ -73,6 +73,10 @@ def print_robots(
         console.print(escape(f"{text} Not known: {robot.unknown}"), highlight=False)
     if not robots:
         return
+    console.print(
+        "On the safe side: what is guaranteed below holds for the robots; where it fails, they may do better.",
+        highlight=False,
+    )
     distance = _length(situation.capture_distance)
     radii = " + ".join(f"{robot.radius:g} m" for robot in robots)
     if "capture_distance" in overrides:
@@ -196,7 +200,8 @@ def _values(change: Change) -> tuple[str, str]:
 def _by(change: Change) -> str:
     if change.needed is None or change.now == 0.0:
         return ""
-    return f"{100.0 * (change.needed / change.now - 1.0):+.3g} %"
+    ratio = change.needed / change.now
+    return f"x {ratio:.3g}" if ratio >= 10.0 else f"{100.0 * (ratio - 1.0):+.3g} %"
 
 
 def _whose(change: Change) -> str:
