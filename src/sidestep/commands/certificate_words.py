@@ -74,7 +74,8 @@ def print_robots(
     if not robots:
         return
     console.print(
-        "On the safe side: what is guaranteed below holds for the robots; where it fails, they may do better.",
+        "On the safe side: what is guaranteed holds for the robots as far as these figures do; where it "
+        "fails, the robots may do better than the model.",
         highlight=False,
     )
     distance = _length(situation.capture_distance)
