@@ -38,7 +38,8 @@ def ended(child, *, interrupts=1):
 def test_outside_held_a_command_ends_at_once_with_130_and_no_traceback():
     code, out, err = ended(
         program(
-            "sys.stdout = open(1, 'w', closefd=False)\nprint('kept')\nos.write(1, b'ready\\n')\ntime.sleep(60)"
+            "sys.stdout = open(1, 'w', closefd=False)\nprint('kept')\n"
+            "os.write(1, b'ready\\n')\ntime.sleep(60)"
         )
     )
     assert (code, out, err) == (130, "kept\n", "")

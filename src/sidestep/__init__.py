@@ -31,6 +31,7 @@ _PUBLIC = {
     "goal_seeking": "world",
     "load_scenario": "world",
     "observe": "world",
+    "robot_fields": "world",
 }
 _ROOMS = ("world", "pursuit", "safety", "learning", "trials", "views")
 
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from sidestep.world import goal_seeking as goal_seeking
     from sidestep.world import load_scenario as load_scenario
     from sidestep.world import observe as observe
+    from sidestep.world import robot_fields as robot_fields
 
 
 def __getattr__(name: str) -> Any:

@@ -42,9 +42,9 @@ def test_each_nearest_change_makes_it_hold_and_less_of_it_does_not(paper):
     game, wanted = paper.situation.game, 0.2
     names = {"pursuer_half_axle": "half_axle"}
     needed = {change.parameter: change.needed for change in paper.nearest_changes}
-    assert list(needed) == list(PARAMETERS)
+    assert set(needed) == set(PARAMETERS)
     assert needed["position_error"] is needed["heading_error"] is needed["delay"] is None
-    assert needed["capture_distance"] == paper.guaranteed_clearance
+    assert 0.0 <= paper.guaranteed_clearance - needed["capture_distance"] < 1e-6
     assert 0.015 < needed["control_period"] < 0.017
     for parameter in ("evader_speed", "pursuer_half_axle", "control_period"):
         name = names.get(parameter, parameter)

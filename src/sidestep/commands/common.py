@@ -43,6 +43,14 @@ def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
     return values
 
 
+def scenario_overrides(pairs: tuple[str, ...], *, zero: bool = False) -> dict[str, Any]:
+    """`parse_overrides` of scenario fields, aliases resolved (see `without_aliases`), so that they may be
+    merged with fields that are stored."""
+    from sidestep.world import without_aliases
+
+    return without_aliases(parse_overrides(pairs), zero=zero)
+
+
 def policy_and_scenario(
     run: str, scenario: str | None, overrides: tuple[str, ...]
 ) -> tuple[Any, Scenario, dict[str, Any]]:
@@ -64,7 +72,7 @@ def scenario_of_run(
     from sidestep.learning.records import open_run
     from sidestep.world import load_scenario
 
-    changes = parse_overrides(overrides)
+    changes = scenario_overrides(overrides)
     config = open_run(run) if run is not None and Path(run).is_dir() else {}
     if scenario is None and config:
         return load_scenario("paper", **{**config["scenario"], **changes}), config

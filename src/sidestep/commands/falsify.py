@@ -13,7 +13,7 @@ from sidestep.commands.common import (
     Overrides,
     ShieldName,
     going_on,
-    parse_overrides,
+    scenario_overrides,
     stood_still,
     write_json_file,
 )
@@ -84,7 +84,7 @@ def run(command: Falsify, console: Console) -> int:
     from sidestep.trials.falsification import ATTACKS, Plan, certified_clearance, falsify
     from sidestep.world import load_scenario
 
-    overrides = parse_overrides(command.set)
+    overrides = scenario_overrides(command.set)
     if command.scenario is None and (Path(command.policy) / "config.json").is_file():
         scenario = load_scenario("paper", **{**open_run(command.policy)["scenario"], **overrides})
     else:

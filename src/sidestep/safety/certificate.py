@@ -15,7 +15,7 @@ measures with errors cannot always tell on which side of the pursuer's axis it i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -24,7 +24,14 @@ import numpy as np
 from sidestep.safety.adapted import covered, of_control_point
 from sidestep.safety.claims import Claim, claims_of
 from sidestep.safety.flow_map import seen_from, side_value
-from sidestep.safety.nearest_changes import Change, nearest_changes
+from sidestep.safety.nearest_changes import (
+    MINE,
+    Change,
+    PairChange,
+    check_mine,
+    nearest_changes,
+    nearest_pairs,
+)
 from sidestep.safety.sampled_design import best_design, broken_level, delay_cost, outruns, tightest_angle
 from sidestep.safety.sampled_game import Design, SampledGame
 from sidestep.safety.shield_check import ShieldLevel, shield_level
@@ -46,6 +53,7 @@ class Certificate:
     - `control_set`: what the certified law never lets the evader into (true positions), or None;
       `start_set` the same grown by the measurement errors (measured positions)
     - `start_margin`: signed distance of the asked start from `start_set`, or None
+    - `nearest_changes` of each parameter alone that would make it hold, `nearest_pairs` of two of mine
     - `grid_error`: how much the computed clearance may still be below the true one (it is never above)
     - `shield`: the level of the `game` shield, `survival` where the pursuer wins
     """
@@ -59,6 +67,7 @@ class Certificate:
     budget: dict[str, float]
     grid_error: float
     nearest_changes: tuple[Change, ...]
+    nearest_pairs: tuple[PairChange, ...]
     control_set: Design | None
     start_set: Design | None
     start: tuple[float, float] | None = None
@@ -85,6 +94,8 @@ class Certificate:
         figures = asdict(self)
         figures["situation"] = {**figures["situation"].pop("game"), **figures["situation"]}
         figures |= {"margin": self.margin, "target": self.target}
+        for shown, change in zip(figures["nearest_changes"], self.nearest_changes, strict=True):
+            shown["share"] = change.share
         figures["unlimited"] = math.isinf(self.guaranteed_clearance)
         for name in ("control_set", "start_set"):
             design = getattr(self, name)
@@ -107,6 +118,7 @@ def certify(
     half_axle: float | None = None,
     control_period: float | None = None,
     check_shield: bool = True,
+    mine: Collection[str] = MINE,
     progress: Callable[[str], None] | None = None,
 ) -> Certificate:
     """What can be guaranteed for a scenario's robots.
@@ -119,7 +131,9 @@ def certify(
     `tracking_error` (m/s) bounds how far the velocity driven is from the one told. `walls`: the robots are in
     a bounded arena. `start`: evader in the pursuer's frame (m). `target_distance` (m): asked of where
     the pursuer wins. `half_axle` and `control_period`: instead of the scenario's; they may be 0 here.
-    `check_shield`: also compute what the shipped `game` shield keeps. `progress` is told what is computed.
+    `check_shield`: also compute what the shipped `game` shield keeps. `mine`: what can be changed, of
+    `nearest_changes.WHOSE` (evader, sensing, task, pursuer): comes first among the changes that would help,
+    and is tried in pairs. `progress` is told what is computed.
 
     **Raises** `ValueError` naming the argument, its value and what is allowed.
     """
@@ -136,6 +150,7 @@ def certify(
         raise ValueError(f"heading_error = {heading_error!r}: it must be less than pi/2 rad")
     if start is not None and (len(start) != 2 or not all(math.isfinite(value) for value in start)):
         raise ValueError(f"start = {start!r}: it must be two finite numbers X,Y in the pursuer's frame")
+    check_mine(mine)
     situation = situation_of(scenario, half_axle, control_period, walls)
     game = replace(
         situation.game,
@@ -147,7 +162,7 @@ def certify(
     )
     situation = replace(situation, game=game)
     tell("what can be held at this period")
-    certificate = _answer(situation, tell)
+    certificate = _answer(situation, mine, tell)
     if start is not None:
         margin = None if certificate.control_set is None else start_margin(certificate, start)
         certificate = replace(certificate, start=start, start_margin=margin)
@@ -162,30 +177,19 @@ def certify(
     return replace(certificate, claims=claims_of(certificate))
 
 
-def _answer(situation: Situation, tell: Callable[[str], None]) -> Certificate:
+def _answer(situation: Situation, mine: Collection[str], tell: Callable[[str], None]) -> Certificate:
     game, wanted = situation.game, situation.capture_distance
-    limit = game.largest_capture_distance
-    tracked = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
-    exact = replace(tracked, tracking_error=0.0)
-    held = best_design(game)
-    sampled = held if exact == game else best_design(exact)
-    driven = sampled if exact == tracked else best_design(tracked)
-    levels = [0.0 if design is None else design.level for design in (sampled, driven)]
-    clearance = 0.0 if held is None else max(held.level - delay_cost(game), 0.0)
-    needed = wanted + delay_cost(game)
-    if outruns(game, needed):
-        clearance = math.inf
-    budget = _budget(game, wanted, clearance, *levels)
-    # The parts of the plain budget bound the clearance too, where they happen to be the stricter ones.
-    if math.isfinite(clearance) and math.isfinite(limit):
-        clearance = max(min(clearance, limit - budget["total"]), 0.0)
+    clearance, budget, held = clearance_of(situation)
     in_the_open = clearance >= wanted
     alone = not situation.walls and situation.pursuer_count == 1
     guaranteed = in_the_open and alone
     changes: tuple[Change, ...] = ()
+    pairs: tuple[PairChange, ...] = ()
     if not guaranteed:
         tell("the nearest changes that make it hold")
-        changes = nearest_changes(situation, clearance)
+        changes = nearest_changes(situation, clearance, mine)
+        pairs = nearest_pairs(situation, budget, changes, mine)
+    needed = wanted + delay_cost(game)
     control, start = _sets(game, needed if in_the_open else None, held) if alone else (None, None)
     unsure = 0.0
     if held is not None and math.isfinite(held.level):
@@ -195,15 +199,39 @@ def _answer(situation: Situation, tell: Callable[[str], None]) -> Certificate:
         situation=situation,
         guaranteed=guaranteed,
         reason=_reason(situation, in_the_open),
-        pursuer_wins=wanted > limit,
+        pursuer_wins=wanted > game.largest_capture_distance,
         guaranteed_clearance=clearance if alone else 0.0,
-        largest_capture_distance=limit,
+        largest_capture_distance=game.largest_capture_distance,
         budget=budget,
         grid_error=unsure,
         nearest_changes=changes,
+        nearest_pairs=pairs,
         control_set=control,
         start_set=start,
     )
+
+
+def clearance_of(situation: Situation) -> tuple[float, dict[str, float], Design | None]:
+    """What an evader alone with one pursuer in the open can keep for ever (m), the budget, and what holds it.
+
+    The capture distance is guaranteed if the clearance is at least that.
+    """
+    game, wanted = situation.game, situation.capture_distance
+    limit = game.largest_capture_distance
+    tracked = replace(game, position_error=0.0, heading_error=0.0, delay=0.0)
+    exact = replace(tracked, tracking_error=0.0)
+    held = best_design(game)
+    sampled = held if exact == game else best_design(exact)
+    driven = sampled if exact == tracked else best_design(tracked)
+    levels = [0.0 if design is None else design.level for design in (sampled, driven)]
+    clearance = 0.0 if held is None else max(held.level - delay_cost(game), 0.0)
+    if outruns(game, wanted + delay_cost(game)):
+        clearance = math.inf
+    budget = _budget(game, wanted, clearance, *levels)
+    # The parts of the plain budget bound the clearance too, where they happen to be the stricter ones.
+    if math.isfinite(clearance) and math.isfinite(limit):
+        clearance = max(min(clearance, limit - budget["total"]), 0.0)
+    return clearance, budget, held
 
 
 def _budget(

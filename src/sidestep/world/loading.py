@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import tomllib
@@ -18,6 +17,7 @@ import numpy as np
 
 from sidestep._arrays import real
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
+from sidestep.world.field_names import ScenarioError, unknown_field, without_aliases
 from sidestep.world.flyers import Aircraft, Quadrotor
 from sidestep.world.model_probe import check_models
 from sidestep.world.models import EvaderModel, PursuerModel
@@ -91,10 +91,6 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
 }
 
 
-class ScenarioError(ValueError):
-    """A scenario that cannot be run: the message names the field, its value and what is allowed."""
-
-
 def _fail(field: str, value: object, allowed: str) -> None:
     raise ScenarioError(f"scenario field '{field}' = {value!r}: {allowed}")
 
@@ -103,11 +99,7 @@ def _check_fields(values: Mapping[str, Any]) -> None:
     known = [field.name for field in fields(Scenario)]
     for name in values:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else "."
-            raise ScenarioError(
-                f"unknown scenario field '{name}'{hint} Known fields: {', '.join(sorted(known))}."
-            )
+            raise ScenarioError(unknown_field(name, known))
 
 
 def _check_number(name: str, value: Any, test: Callable[[float], bool], allowed: str) -> None:
@@ -274,7 +266,8 @@ def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
     otherwise). A run's `config.json` can be given too: its `scenario` entry is used. Reducing
     `obstacle_count` or `pursuer_count` below the fixed starts keeps the first ones. The robots that fly are
     known by name, in files too: `evader_model = "quadrotor"`, `pursuer_model = {model = "aircraft",
-    turning_radius = 3.0}`.
+    turning_radius = 3.0}`. In files and overrides alike, `wheel_separation` (m, what data sheets of
+    differential drives print) may stand for `pursuer_half_axle`, which is half of it.
 
     **Raises** `ScenarioError` (a `ValueError`) naming the field, its value and what is allowed.
     """
@@ -308,7 +301,7 @@ def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
 
 def _changed(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """`values` with `changes`; starts that are given anew bring their own number with them."""
-    kept = dict(values)
+    kept, changes = dict(values), without_aliases(changes)
     for starts, count in _STARTS.items():
         if changes.get(starts) is not None:
             kept.pop(count, None)

@@ -94,9 +94,10 @@ def run_campaign(
     and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
     place of `run_task`.
 
-    **Raises** `ValueError` when a script calls it without a main guard, when another call works on this folder,
-    when it holds something else, when no scheduler answers, and for bad options; and when the extra `cluster`
-    is missing. `OutputError` when the folder's disk is full; what is in it stays, and the next call goes on.
+    **Raises** `ValueError` when a script calls it without a main guard, when another call works on the
+    folder, when it holds something else, when no scheduler answers, and for bad options; and when the extra
+    `cluster` is missing. `OutputError` when the folder's disk is full; what is in it stays, and the next
+    call goes on.
     """
     from sidestep.bridges.campaigns.table import write_table
     from sidestep.trials.campaign import Store, campaign_rows

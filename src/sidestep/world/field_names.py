@@ -1,0 +1,136 @@
+"""Which scenario field is meant? Names that data sheets use, as aliases or as advice in the error."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be run: the message names the field, its value and what is allowed."""
+
+
+ALIASES: dict[str, tuple[str, float]] = {"wheel_separation": ("pursuer_half_axle", 0.5)}
+"""Alias -> field, and what its value is multiplied by."""
+
+_SPEEDS = (
+    "say whose: 'evader_speed' (in every direction) or 'pursuer_speed' (the most that a wheel's rim makes, "
+    "|v| + b|omega|)"
+)
+_TRACK = "the distance between a pursuer's left and right wheels is 'wheel_separation'"
+_SIZE = (
+    "distances are between centres: 'capture_distance' (to touch: the sum of both robots' radii) and "
+    "'collision_distance' (evader and obstacle)"
+)
+_TURNING = (
+    "a differential drive turns at up to 'pursuer_speed' / 'pursuer_half_axle'; robots with a limit of their "
+    "own are covered by a larger 'pursuer_speed', see docs/certificate.md"
+)
+_PERIOD = "the time between two decisions is 'control_period', in s"
+_ERRORS = (
+    "what is measured and how late is no part of a scenario: it is an option of certify (--position-error, "
+    "--heading-error, --delay, --tracking-error) and of sidestep.safety.Budget"
+)
+_ADVICE = {
+    **dict.fromkeys(
+        (
+            "speed", "max_speed", "maximum_speed", "top_speed", "velocity", "max_velocity", "max_vel",
+            "max_vel_x", "max_linear_velocity", "maximum_linear_velocity", "linear_velocity", "v_max",
+            "max_translational_velocity", "maximum_translational_velocity",
+        ),
+        _SPEEDS,
+    ),
+    **dict.fromkeys(
+        (
+            "wheel_speed", "rim_speed", "max_wheel_speed", "wheel_velocity", "pursuer_max_speed",
+            "pursuer_velocity", "pursuer_top_speed",
+        ),
+        "the most that a rim of the pursuer's wheels makes is 'pursuer_speed'",
+    ),
+    **dict.fromkeys(
+        ("evader_max_speed", "evader_velocity", "evader_top_speed", "robot_speed"),
+        "the evader's speed in every direction is 'evader_speed'",
+    ),
+    **dict.fromkeys(
+        (
+            "track", "track_width", "wheel_track", "wheel_distance", "wheels_separation", "wheel_spacing",
+            "axle_length", "axle_width", "axle_track", "distance_between_wheels", "half_axle", "axle",
+        ),
+        f"{_TRACK}; half of it is 'pursuer_half_axle'",
+    ),
+    **dict.fromkeys(
+        ("wheelbase", "wheel_base"),
+        f"{_TRACK}, if that is meant; the distance from front to rear axle plays no part",
+    ),
+    **dict.fromkeys(
+        (
+            "radius", "robot_radius", "evader_radius", "pursuer_radius", "footprint", "diameter", "length",
+            "width", "size", "capture_radius", "collision_radius", "safety_distance",
+        ),
+        _SIZE,
+    ),
+    **dict.fromkeys(
+        (
+            "omega_max", "max_omega", "turn_rate", "max_turn_rate", "yaw_rate", "max_yaw_rate",
+            "angular_velocity", "max_angular_velocity", "maximum_angular_velocity", "max_vel_theta",
+            "max_rotational_velocity", "maximum_rotational_velocity", "turning_radius",
+        ),
+        _TURNING,
+    ),
+    **dict.fromkeys(
+        ("period", "dt", "time_step", "timestep", "rate", "frequency", "hz", "control_rate", "sample_time"),
+        _PERIOD,
+    ),
+    **dict.fromkeys(
+        ("delay", "latency", "position_error", "heading_error", "tracking_error", "noise", "sensor_noise"),
+        _ERRORS,
+    ),
+    **dict.fromkeys(
+        ("target_radius", "goal_radius", "goal_tolerance", "goal_distance", "arrival_distance"),
+        "a target counts as reached from 'reach_distance' on",
+    ),
+    **dict.fromkeys(
+        ("arena", "arena_size", "arena_width", "world_size"),
+        "the square that starts and targets are drawn in is 'arena_side'",
+    ),
+}  # fmt: skip
+"""What to say of a name that is no field but that people will try: no spelling is near to what it means."""
+
+
+def without_aliases(values: Mapping[str, Any], *, zero: bool = False) -> dict[str, Any]:
+    """`values` with fields in the place of aliases: `wheel_separation=0.16` is `pursuer_half_axle=0.08`.
+
+    **Arguments:** `zero` whether 0 is allowed (only a certificate can do with it).
+
+    **Raises** `ScenarioError` for a value that is no number above 0, or an alias beside its field.
+    """
+    plain = dict(values)
+    for alias, (field, factor) in ALIASES.items():
+        if alias not in plain:
+            continue
+        value = plain.pop(alias)
+        if field in plain:
+            raise ScenarioError(
+                f"'{alias}' = {value!r} and '{field}' = {plain[field]!r} are both given, and both say the "
+                f"same ('{field}' is {factor:g} times '{alias}'): give one of them"
+            )
+        try:
+            number = math.nan if isinstance(value, (bool, str)) else float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        if not (math.isfinite(number) and (number > 0.0 or (zero and number == 0.0))):
+            bound = "0 or more" if zero else "greater than 0"
+            raise ScenarioError(f"scenario field '{alias}' = {value!r}: it must be finite and {bound}")
+        plain[field] = factor * number
+    return plain
+
+
+def unknown_field(name: str, known: Iterable[str]) -> str:
+    """What to say of a name that is neither a field nor an alias."""
+    names = sorted([*known, *ALIASES])
+    meant = _ADVICE.get(name.lower().replace("-", "_"))
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f": {meant}." if meant else f"; did you mean '{near[0]}'?" if near else "."
+    return f"unknown scenario field '{name}'{hint} Known fields: {', '.join(names)}."
