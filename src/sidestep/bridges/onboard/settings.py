@@ -74,6 +74,12 @@ class OnboardSettings:
             raise ValueError("onboard settings: " + "; ".join(wrong))
 
     @property
+    def forgotten_after(self) -> float:
+        """For how long (s) motions, sides and plans may go without a pose or a decision before they say
+        nothing any more: a second, or `stale_after` if that is more."""
+        return max(1.0, self.stale_after)
+
+    @property
     def response(self) -> float:
         """From a decision to when its command acts, s."""
         return self.actuation_delay + self.motor_lag
