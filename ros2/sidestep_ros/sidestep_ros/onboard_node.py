@@ -130,8 +130,9 @@ class OnboardNode(Node, abc.ABC):
             self.complaints.add(
                 "clock", f"it went back by {self._decided_at - now:.3f} s: everything begins anew"
             )
-            self.onboard.reset()
+            # The decision core finds out for itself.
             self._robots.forget()
+            self._report_at = self._paint_at = -math.inf
         self._decided_at = now
         decision = self.onboard.decide(now)
         x, y = map(float, self.velocity_of(decision))

@@ -107,7 +107,9 @@ class Answering:
         """What was decided, and the next memory. `delay` (s) replaces the budget's."""
         parts = (*world, wished, ask, flee, delay)
         numbers = np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in parts])
-        vector, memory = self._compiled(self._arrays, numbers.astype(real(0.0).dtype), memory)
+        with np.errstate(over="ignore"):  # Infinite is what it is then, and no answer follows from it.
+            numbers = numbers.astype(real(0.0).dtype)
+        vector, memory = self._compiled(self._arrays, numbers, memory)
         return Answer.of(np.asarray(vector, np.float64), self._count), memory
 
 

@@ -7,7 +7,6 @@ at which they were true, ask it once per control period, and drive what it answe
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from jaxtyping import Float
 from sidestep.bridges.onboard.answering import Answering, Numbers, Seen
 from sidestep.bridges.onboard.decision import LEVELS, Decision
 from sidestep.bridges.onboard.estimates import Estimates
+from sidestep.bridges.onboard.intake import Intake
 from sidestep.bridges.onboard.pace import Pace
 from sidestep.bridges.onboard.readings import LARGEST, Reading, as_numbers
 from sidestep.bridges.onboard.settings import OnboardSettings
@@ -33,32 +33,31 @@ from sidestep.safety.way_out import way_out
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario, World
 
-_AHEAD = 1.0
-"""A stamp farther ahead (s) of the last decision is from the future, as far as anybody can tell."""
-_NAMES = 1000
-"""So many robots that the scenario does not have are counted by name; further ones together."""
-
 
 @final
 class Onboard:
-    """Decides for one evader; see `OnboardSettings` for what it is told of its sensors and of faults.
+    """Decides for one evader; see `OnboardSettings` for what it knows of its sensors and of faults.
 
     Feed it with `see` and, without a policy, `nominal`; set `target` for a policy; call `decide` once per
-    control period and drive what it answers until the next. Times (s) are of any one monotonic clock, the
-    same for poses and decisions. Not for several threads at once.
+    control period and drive what it answers until the next. Times (s) are of one clock, the same for poses
+    and decisions. Not for several threads at once.
 
     **Arguments:** `shield` a name, or a shield of this scenario (then its own budget counts, not that of the
-    settings); `policy` None if wishes are fed in, `goal-seeking`, a run folder, or any policy.
+    settings); `policy` None if nominal velocities are fed in, `goal-seeking`, a run folder, or any policy.
 
-    **Reactions.** Poses that are not finite, out of order, from the future or jumps are dropped and counted.
-    A pursuer's pose is allowed for by its age, or by `budget.delay` if that is more. One older than usual
-    means `degraded`; older than `stale_after`, `evade` (the wish is ignored, the robot flees from the pursuer
-    as last seen) or `stop`, as `on_fault` says; without its own pose, or before every robot of the scenario
-    has been seen, the robot stops. A lost wish counts as a wish to stand still. A core that is called late
-    adds the lateness to the delay, and if it happens again and again decides by the rows alone, without
-    looking ahead, until it has kept pace for a while. A clock that goes back stops the robot for that period.
+    **Reactions.** Poses that are no numbers, of the wrong length, not finite, too large, out of order, from
+    the future or jumps are dropped and counted. A pursuer's pose is allowed for by its age, or by
+    `budget.delay` if that is more. One older than usual means `degraded`; older than `stale_after`, `evade`
+    (the nominal velocity is ignored, the robot flees from the pursuer as last seen) or `stop`, as `on_fault`
+    says; without its own pose, or before every robot of the scenario has been seen, the robot stops. A lost
+    nominal velocity counts as zero. A core that is called late adds the lateness to the delay, and if it
+    happens again and again decides by the rows alone, without looking ahead, until it has kept pace for a
+    while. A clock that goes back stops the robot for that period; everything that has a time is forgotten,
+    and decisions go on as soon as poses and clock agree again. So they do after a pause, or a clock that
+    went ahead: then motions and the plan are forgotten.
 
-    **Raises** `ValueError` or `TypeError` for settings, a shield, a policy or a target that cannot be.
+    **Raises** `ValueError` or `TypeError` for settings, a shield, a policy or a target that cannot be, and
+    nothing for what is seen or for the time of a decision.
     """
 
     def __init__(
@@ -100,14 +99,18 @@ class Onboard:
         """Forget all poses, wishes, faults and commands; keep what was compiled, and the target."""
         self._estimates = Estimates(self.scenario, self.settings)
         self._pace = Pace(self._period, self.settings)
-        self.counts: Counter[tuple[str, Reading]] = Counter()
-        self._news: Counter[tuple[str, Reading]] = Counter()
-        self._waiting: list[tuple[str, Callable[[float | None], Reading]]] = []
+        self._intake = Intake(self._period + self.settings.future_tolerance)
         self._wish: tuple[float, Numbers] | None = None
         self._held = np.full(2, np.nan)
         self._now: float | None = None
         self._decided = 0
         self._memory: Any = None
+
+    @property
+    def counts(self) -> Counter[tuple[str, Reading]]:
+        """What became of the poses of each robot (`evader`, `pursuer 0`, ...), of nominal velocities
+        (`nominal`) and of times of decisions that could not be used (`clock`), since the last `reset`."""
+        return self._intake.counts
 
     @property
     def target(self) -> Float[np.ndarray, "2"]:
@@ -130,9 +133,9 @@ class Onboard:
         """
         gate = self._estimates.gate(robot, index)
         if gate is None:
-            return self._count(self._name_of(robot, index), Reading.UNKNOWN_ROBOT)
+            return self._intake.unknown(robot, index)
         shapes = ((2,), (3,)) if robot == "obstacle" else ((3,),)
-        return self._judge(gate.name, gate.take, stamp, as_numbers(pose, *shapes), now)
+        return self._intake.judge(gate.name, gate.take, stamp, as_numbers(pose, *shapes), now, self._now)
 
     def nominal(self, stamp: Any, velocity: Any, *, now: float | None = None) -> Reading:
         """A wished velocity (m/s, world axes), given at `stamp` (s); only without a policy. `now` and what
@@ -142,7 +145,8 @@ class Onboard:
         """
         if self._policy is not None:
             raise ValueError("this core has a policy of its own: it takes no nominal velocity")
-        return self._judge("nominal", self._take_wish, stamp, as_numbers(velocity, (2,)), now)
+        numbers = as_numbers(velocity, (2,))
+        return self._intake.judge("nominal", self._take_wish, stamp, numbers, now, self._now)
 
     def _take_wish(self, stamp: float, velocity: Numbers, now: float | None) -> Reading:
         if np.any(np.abs(velocity) > LARGEST):
@@ -153,40 +157,6 @@ class Onboard:
             return Reading.OUT_OF_ORDER
         self._wish = (stamp, velocity)
         return Reading.ACCEPTED
-
-    def _judge(
-        self, name: str, take: Callable[..., Reading], stamp: Any, numbers: Numbers | Reading, now: Any
-    ) -> Reading:
-        """Judge what was handed in by `take(stamp, numbers, now)`, or have it wait until the clock is known."""
-        when, clock = as_numbers(stamp, ()), as_numbers(now, ())
-        for part in (when, numbers):
-            if isinstance(part, Reading):
-                return self._count(name, part)
-        time = float(when)
-        if not isinstance(clock, Reading):
-            return self._count(name, take(time, numbers, float(clock)))
-        if self._now is not None and time > self._now + _AHEAD:
-            return self._count(name, Reading.FROM_THE_FUTURE)
-        if self._now is not None and time > self._latest(self._now):
-            self._waiting.append((name, functools.partial(take, time, numbers)))
-            return Reading.WAITING
-        return self._count(name, take(time, numbers, None))
-
-    def _latest(self, now: float) -> float:
-        """The latest stamp (s) that is surely not from the future of the decision that follows `now`."""
-        return now + self._period + self.settings.future_tolerance
-
-    def _name_of(self, robot: Any, index: Any) -> str:
-        """Of a robot that the scenario does not have: whatever somebody sent."""
-        known = isinstance(robot, str) and isinstance(index, (int, np.integer))
-        name = f"{robot[:40]} {index}"[:60] if known else "robot without a name"
-        return name if len(self.counts) < _NAMES else "further robots"
-
-    def _count(self, name: str, reading: Reading) -> Reading:
-        self.counts[(name, reading)] += 1
-        if reading is not Reading.ACCEPTED:
-            self._news[(name, reading)] += 1
-        return reading
 
     def warm_up(self) -> float:
         """Compile what decisions need, the fall-back included; returns the seconds it took."""
@@ -208,14 +178,13 @@ class Onboard:
         clock = as_numbers(now, ())
         if isinstance(clock, Reading):
             self.counts[("clock", clock)] += 1
-            return self._stop([*self._told(), f"the clock is {clock.value}: stopped for this period"], begun)
+            words = f"the clock cannot be used ({clock.value}): stopped for this period"
+            return self._stop([*self._intake.told(), words], begun)
         now = float(clock)
         if self._now is not None and now <= self._now:
             return self._stop(self._turned_back(now), begun, now)
-        for name, take in self._waiting:
-            self._count(name, take(now))
-        self._waiting.clear()
-        reactions = self._told()
+        self._intake.settle(now)
+        reactions = self._intake.told()
         self._forget_ahead(now, reactions)
         lateness = self._paced(now, reactions)
         level = int(self._pace.late or self._pace.behind)
@@ -243,6 +212,7 @@ class Onboard:
         else:
             answer, self._memory = self._whole(seen, wished, ask, flee, delay, self._memory)
         if not np.all(np.isfinite(answer.action)):
+            self._forget_plan()
             reactions.append("the shield's answer was not finite: stopped for this period")
             return self._stop(reactions, begun, now)
         self._estimates.evader.told(now, answer.action)
@@ -272,41 +242,27 @@ class Onboard:
             return lambda: np.zeros((0, 2))
         return lambda: np.asarray(way_out(shield, seen.world(), memory), float)
 
-    def _told(self) -> list[str]:
-        """What was not believed since the last decision, and what began anew, in words."""
-        words = []
-        for (name, reading), count in sorted(self._news.items(), key=lambda item: item[0][0]):
-            if reading is Reading.RELOCATED:
-                words.append(f"{name}: is somewhere else now, its track begins anew")
-            elif reading is Reading.RESUMED:
-                words.append(f"{name}: seen again after a while, its motion is forgotten")
-            else:
-                words.append(f"{name}: {count} {reading.value}, dropped")
-        self._news.clear()
-        return words
-
     def _turned_back(self, now: float) -> list[str]:
         """The clock goes back to `now` (s), or stands still: what happened and was forgotten, in words."""
         assert self._now is not None
         back, self._now = self._now - now, now
         self.counts[("clock", Reading.OUT_OF_ORDER)] += 1
         if not back:
-            return [*self._told(), f"the clock stands still at {now:.3f} s: stopped for this period"]
+            return [*self._intake.told(), f"the clock stands still at {now:.6g} s: stopped for this period"]
         # No stamp from before compares with those that follow: a robot last seen a minute ago could seem
         # to have been seen just now.
         self._estimates.forget()
         self._wish = None
         self._forget_plan()
         self._pace.interrupted()
-        for name, _ in self._waiting:
-            self._count(name, Reading.FROM_THE_FUTURE)
-        self._waiting.clear()
+        self._intake.settle(now)
         forgotten = "poses, motions, nominal velocity and plan are forgotten"
-        return [*self._told(), f"the clock went back by {back:.3f} s: {forgotten}; stopped for this period"]
+        words = f"the clock went back by {back:.6g} s: {forgotten}; stopped for this period"
+        return [*self._intake.told(), words]
 
     def _forget_ahead(self, now: float, reactions: list[str]) -> None:
         """Forget what was believed before the clock was known, and turns out to be from its future."""
-        latest = self._latest(now)
+        latest = self._intake.latest(now)
         names = self._estimates.forget(beyond=latest)
         if self._wish is not None and self._wish[0] > latest:
             self._wish = None
@@ -322,12 +278,13 @@ class Onboard:
 
     def _paced(self, now: float, reactions: list[str]) -> float:
         """What to allow for (s) since decisions come late; after a pause, what was kept in mind goes."""
-        gap = 0.0 if self._now is None else now - self._now
         late = self._pace.called(now)
-        if gap > self.settings.forgotten_after:
+        if self._pace.paused:
             self.counts[("clock", Reading.JUMP)] += 1
             self._forget_plan()
-            reactions.append(f"the clock went ahead by {gap:.3f} s without a decision: plan forgotten")
+            reactions.append(
+                f"no decision for {late + self._period:.6g} s (a pause, or a clock set ahead): sides and plan are forgotten"
+            )
         elif late:
             reactions.append(f"late by {1e3 * late:.1f} ms: allowed for as delay")
         if self._pace.behind and self._rows is not None:
@@ -388,7 +345,8 @@ class Onboard:
         return self._estimate(float(clock) + self.settings.response).world()
 
     def _estimate(self, acts: float) -> Seen:
-        return self._estimates.at(acts, self._target, self._decided * self._period)
+        with np.errstate(all="ignore"):
+            return self._estimates.at(acts, self._target, self._decided * self._period)
 
     def _stop(self, reactions: list[str], begun: float, now: float | None = None) -> Decision:
         if now is not None:

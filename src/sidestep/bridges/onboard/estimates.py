@@ -34,14 +34,15 @@ class Estimates:
             for _ in range(scenario.obstacle_count)
         ]
         self._predict = settings.predict_pursuer
+        known = settings, settings.forgotten_after(float(scenario.control_period))
         self._gates = {
-            "evader": [Gate("evader", self.evader, speed, math.inf, settings)],
+            "evader": [Gate("evader", self.evader, speed, math.inf, *known)],
             "pursuer": [
-                Gate(f"pursuer {index}", track, rim, rim / axle, settings)
+                Gate(f"pursuer {index}", track, rim, rim / axle, *known)
                 for index, track in enumerate(self._pursuers)
             ],
             "obstacle": [
-                Gate(f"obstacle {index}", track, max(drift, rim), 0.0, settings)
+                Gate(f"obstacle {index}", track, max(drift, rim), 0.0, *known)
                 for index, track in enumerate(self._obstacles)
             ],
         }
@@ -55,7 +56,7 @@ class Estimates:
         gates = self._gates.get(robot, []) if isinstance(robot, str) else []
         try:
             number = operator.index(index)
-        except TypeError:
+        except Exception:  # Whatever an object of somebody's raises: it is no number of a robot.
             return None
         return gates[number] if 0 <= number < len(gates) else None
 

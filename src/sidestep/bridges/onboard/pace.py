@@ -15,14 +15,15 @@ class Pace:
     """How late decisions are, of late.
 
     - `lateness` (s) to allow for: that of this decision, or of earlier ones as far as not forgotten
-    - `late` whether this decision is; `behind` whether so many were that less must be computed
+    - `late` whether this decision is; `paused` whether by so much that it is no lateness, but a pause, or the
+      clock was set ahead; `behind` whether so many were late that less must be computed
     """
 
     def __init__(self, period: float, settings: OnboardSettings):
         self._period, self._settings = period, settings
         self._since: float | None = None
         self._late_in_a_row, self._on_time = 0, 0
-        self.lateness, self.behind = 0.0, False
+        self.lateness, self.behind, self.paused = 0.0, False, False
 
     @property
     def late(self) -> bool:
@@ -34,7 +35,7 @@ class Pace:
 
     def called(self, now: float) -> float:
         """To be called for each decision, at `now` (s), later than the one before; how late it is, s."""
-        since, self._since = self._since, now
+        since, self._since, self.paused = self._since, now, False
         if since is None:
             return 0.0
         elapsed, settings = now - since, self._settings
@@ -47,8 +48,9 @@ class Pace:
             self.behind = True
         elif self.behind and self._on_time >= _CALM:
             self.behind = False
-        # Nothing pays for a pause, nor for a clock that was set.
-        paid = min(late, settings.stale_after) if elapsed > settings.forgotten_after else late
+        self.paused = elapsed > settings.forgotten_after(self._period)
+        # No delay pays for a pause: poses that are as old as that are stale.
+        paid = min(late, settings.stale_after) if self.paused else late
         # What was late once may be so again: forgotten over some periods.
         self.lateness = max(paid, 0.8 * self.lateness if self.lateness > 1e-4 else 0.0)
         return late

@@ -13,7 +13,7 @@ from sidestep.bridges.onboard.settings import OnboardSettings
 from sidestep.bridges.onboard.tracks import Track, turned
 
 LARGEST = 1e4
-"""The largest position (m) and speed (m/s) that can be used: beyond, single precision errs by more than 1 mm."""
+"""The largest position (m) and speed (m/s) to be used: beyond, single precision errs by more than 1 mm."""
 
 
 class Reading(enum.Enum):
@@ -66,12 +66,21 @@ class Gate:
     A robot that makes `speed` (m/s) and turns at `turn_rate` (rad/s) can only be so far from where it was. A
     pose from beyond that is a jump; once `jump_confirmations` in a row agree with each other it was the track
     that was wrong, or somebody has carried the robot, and the track begins anew. It does so, too, at the
-    first pose after more than `forgotten_after` seconds.
+    first pose after more than `forgotten_after` (s).
     """
 
-    def __init__(self, name: str, track: Track, speed: float, turn_rate: float, settings: OnboardSettings):
+    def __init__(
+        self,
+        name: str,
+        track: Track,
+        speed: float,
+        turn_rate: float,
+        settings: OnboardSettings,
+        forgotten_after: float,
+    ):
         self.name, self.track = name, track
         self._speed, self._turn_rate, self._settings = speed, turn_rate, settings
+        self._forgotten_after = forgotten_after
         self._elsewhere: tuple[float, Float[np.ndarray, "d"]] | None = None
         self._agreed = 0
 
@@ -97,7 +106,7 @@ class Gate:
         if not self._reaches(self.track.at(last), pose, stamp - last):
             return self._jumped(stamp, pose)
         self._elsewhere, self._agreed = None, 0
-        if stamp - last > self._settings.forgotten_after:
+        if stamp - last > self._forgotten_after:
             self.track.start(stamp, pose)
             return Reading.RESUMED
         self.track.take(stamp, pose)
