@@ -290,11 +290,37 @@ def test_a_policy_holds_still_once_it_has_arrived():
     assert not np.any(run(there, 2, without=("nominal",)).velocity)
 
 
-def test_a_core_that_keeps_falling_behind_goes_without_looking_ahead_until_it_keeps_pace():
+@pytest.fixture(scope="module")
+def joint_core():
     # One model of the pursuer: what is compiled is smaller.
     shield = JointShield(SCENARIO, budget=Budget(), models=("nash",))
     core = Onboard(SCENARIO, shield, "goal-seeking")
     core.target = (2.0, 1.0)
+    return core
+
+
+def test_the_plan_of_another_world_is_not_followed_after_a_jump_and_the_policy_is_asked_anew(
+    joint_core, monkeypatch
+):
+    core, asked, whole = joint_core, [], joint_core._whole
+    core.reset()
+    # As for a policy that decides every fourth period.
+    monkeypatch.setattr(core, "_decision_steps", 4)
+    monkeypatch.setattr(core, "_whole", lambda *given: (asked.append(given[2]), whole(*given))[1])
+    near = {"pursuer": (0.3, 0.0, math.pi), "without": ("nominal",)}
+    begun = [run(core, 1, 200 + count, **near) for count in range(10)]
+    assert int(core._memory.calls) == 10
+    assert core.decide(2.0).level == "stop"
+    assert core._memory is None
+    again = [run(core, 1, 41 + count, **near) for count in range(10)]
+    for before, after in zip(begun, again, strict=True):
+        np.testing.assert_allclose(after.velocity, before.velocity, atol=2e-3)
+    assert asked == 2 * [count % 4 == 0 for count in range(10)]
+
+
+def test_a_core_that_keeps_falling_behind_goes_without_looking_ahead_until_it_keeps_pace(joint_core):
+    core = joint_core
+    core.reset()
     with pytest.raises(ValueError, match="policy of its own"):
         core.nominal(0.0, WISH)
     run(core, 3, without=("nominal",))

@@ -23,6 +23,7 @@ class Chase(Robots):
 
     def __init__(self, time=None):
         self.time, self.least, self.going = time, math.inf, False
+        self.set_by, self.decided = 0.0, []
         super().__init__()
         self.poses["obstacle"] = [0.0, 5.0, 0.0]
         self.nominal = (0.0, 0.0)
@@ -37,7 +38,8 @@ class Chase(Robots):
 
     def _tick(self):
         if self._clock is not None:
-            self.time += self.period
+            ahead, self.set_by = self.set_by, 0.0
+            self.time += self.period + ahead
             seconds, rest = divmod(round(self.time * NANOSECONDS), NANOSECONDS)
             self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
         super()._tick()
@@ -54,31 +56,35 @@ class Chase(Robots):
         heading += turn
         self.poses["pursuer"] = [x + way * math.cos(heading), y + way * math.sin(heading), heading]
 
-    def levels(self, begin=0):
-        """Levels and words of the decisions told of since."""
-        told = [statuses["decisions"] for statuses in self.told[begin:] if "decisions" in statuses]
-        return [(values_of(status)["level"], status.message) for status in told if status.values]
+    def _read(self, message):
+        super()._read(message)
+        status = self.told[-1].get("decisions")
+        if status is not None and status.values:
+            self.decided.append((values_of(status)["level"], status.message))
 
 
 def is_normal(robots):
-    levels = robots.levels()
-    return bool(levels) and levels[-1][0] == "normal"
+    return bool(robots.decided) and robots.decided[-1][0] == "normal"
+
+
+def heard(robots, begin, words):
+    return wait_until(
+        lambda: next((i for i, (_, said) in enumerate(robots.decided[begin:], begin) if words in said), None),
+        f"'{words}' in the diagnostics",
+    )
 
 
 def check_that_it_went_on(robots, begin, report, what):
     """It says that the clock went back, and stands still for a moment only."""
-    wait_until(
-        lambda: any("went back" in words for _, words in robots.levels(begin)), "the clock to be noticed"
-    )
-    # The evader is at rest: without it a pursuer at 0.2 m/s is there after some 5 s.
+    first = heard(robots, begin, "went back")
+    # The evader is to stay at rest: if it does, a pursuer at 0.2 m/s is there after some 6 s.
     wait_until(lambda: robots.least < 0.3, "the pursuer")
-    count = len(robots.told)
-    wait_until(lambda: len(robots.told) > count + 40, "two seconds more")
-    levels = robots.levels(begin)
-    first = next(index for index, (_, words) in enumerate(levels) if "went back" in words)
-    stops = sum(level == "stop" for level, _ in levels[first : first + 100])
-    report(f"{what}: {stops} decisions to stop, least distance {1e3 * robots.least:.0f} mm")
-    assert stops <= 4
+    count = len(robots.decided)
+    wait_until(lambda: len(robots.decided) > count + 40, "two seconds more")
+    stops = [index - first for index, (level, _) in enumerate(robots.decided) if level == "stop"]
+    report(f"{what}: stops at decisions {stops} from then, least distance {1e3 * robots.least:.0f} mm")
+    # A busy machine may be late with poses at any time; what must not be is a stop that lasts.
+    assert len([index for index in stops if 0 <= index < 40]) <= 8
     assert robots.least > CAPTURE
 
 
@@ -90,12 +96,12 @@ def test_a_simulated_clock_that_begins_anew_as_when_a_bag_loops(middleware, star
         )
         node.wait_ready()
         wait_until(lambda: is_normal(robots), "a normal decision")
-        robots.going, begin = True, len(robots.told)
-        robots.time = 3.0
-        check_that_it_went_on(robots, begin, report, "simulated clock set back by 100 s")
-        begin = len(robots.told)
-        robots.time += 1000.0
-        wait_until(lambda: any("set ahead" in words for _, words in robots.levels(begin)), "the jump")
+        robots.going, begin = True, len(robots.decided)
+        robots.set_by = -97.0
+        check_that_it_went_on(robots, begin, report, "simulated clock set back by 97 s")
+        begin = len(robots.decided)
+        robots.set_by = 1000.0
+        heard(robots, begin, "set ahead")
         wait_until(lambda: is_normal(robots), "a normal decision")
         assert robots.least > CAPTURE
         assert node.stop() == 0, node.said
@@ -112,7 +118,7 @@ def test_a_clock_that_is_set_back_by_a_time_server_while_a_log_is_written(middle
     node.get_ready()
     with Spinner(robots), Spinner(node):
         wait_until(lambda: is_normal(robots), "a normal decision")
-        robots.going, begin = True, len(robots.told)
+        robots.going, begin = True, len(robots.decided)
         # Now and stamps alike are minutes earlier, before the node began.
         node.times._epoch += 600 * NANOSECONDS
         check_that_it_went_on(robots, begin, report, "wall clock set back by 10 minutes")

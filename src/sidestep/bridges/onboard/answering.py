@@ -34,15 +34,16 @@ class Seen(NamedTuple):
 
     def world(self) -> World:
         """As the rest of the package knows it."""
-        return World(
-            self.evader,
-            self.pursuers,
-            self.obstacles,
-            self.target,
-            np.float64(self.time),
-            evader_velocity=self.velocity,
-            wheel_speeds=self.wheel_speeds,
-        )
+        with np.errstate(over="ignore"):  # As in `Answering`.
+            return World(
+                self.evader,
+                self.pursuers,
+                self.obstacles,
+                self.target,
+                np.float64(self.time),
+                evader_velocity=self.velocity,
+                wheel_speeds=self.wheel_speeds,
+            )
 
 
 class Answer(NamedTuple):

@@ -124,7 +124,7 @@ class Onboard:
             raise ValueError(f"target = {place!r}: it must be two finite numbers (x, y), m")
         self._target = point
 
-    def see(self, robot: Any, stamp: Any, pose: Any, index: Any = 0, *, now: float | None = None) -> Reading:
+    def see(self, robot: Any, stamp: Any, pose: Any, index: Any = 0, *, now: Any = None) -> Reading:
         """A pose of `evader`, `pursuer` or `obstacle`: x, y (m) and, but for obstacles, heading (rad).
 
         `stamp` (s) is when it was true. `now`: the clock (s), to know a stamp from the future. Without it a
@@ -137,7 +137,7 @@ class Onboard:
         shapes = ((2,), (3,)) if robot == "obstacle" else ((3,),)
         return self._intake.judge(gate.name, gate.take, stamp, as_numbers(pose, *shapes), now, self._now)
 
-    def nominal(self, stamp: Any, velocity: Any, *, now: float | None = None) -> Reading:
+    def nominal(self, stamp: Any, velocity: Any, *, now: Any = None) -> Reading:
         """A wished velocity (m/s, world axes), given at `stamp` (s); only without a policy. `now` and what
         cannot be used: as for `see`.
 
@@ -282,9 +282,8 @@ class Onboard:
         if self._pace.paused:
             self.counts[("clock", Reading.JUMP)] += 1
             self._forget_plan()
-            reactions.append(
-                f"no decision for {late + self._period:.6g} s (a pause, or a clock set ahead): sides and plan are forgotten"
-            )
+            gap = f"no decision for {late + self._period:.6g} s (a pause, or a clock set ahead)"
+            reactions.append(f"{gap}: sides and plan are forgotten")
         elif late:
             reactions.append(f"late by {1e3 * late:.1f} ms: allowed for as delay")
         if self._pace.behind and self._rows is not None:
