@@ -97,6 +97,7 @@ class OnboardNode(Node, abc.ABC):
         self.listen()
         patience = self._cycle.patience if self.values["trigger"] == "poses" else self._cycle.period
         self._watchdog = self.create_timer(patience, self._decide, clock=self.times.timer_clock)
+        self.times.when_set_back(self._watchdog.reset)
         self.get_logger().info(f"ready after {time.perf_counter() - began:.1f} s")
 
     def _rehearse(self) -> None:
