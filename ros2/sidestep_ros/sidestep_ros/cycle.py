@@ -41,7 +41,8 @@ class Cycle:
     def is_due(self, now: float) -> bool:
         """Whether poses that are complete at `now` (s) are to be decided on."""
         share = _SOON if self._out_of_step else _EARLY
-        return now - self._last >= share * self.period
+        # A simulated clock may go back.
+        return now < self._last or now - self._last >= share * self.period
 
     def sent(self, now: float, took: float, *, in_step: bool) -> Late | None:
         """To be told of each command as it goes out at `now` (s), after a decision that took `took` (s).

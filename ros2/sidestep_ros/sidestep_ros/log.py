@@ -15,6 +15,7 @@ class DecisionLog:
 
     def __init__(self, path: str, scenario: Any, frame: str, about: dict[str, Any]):
         self._writer: Any = None
+        self._ahead, self._last = 0.0, 0.0
         if not path:
             return
         from sidestep.bridges.logs import LogWriter
@@ -25,13 +26,18 @@ class DecisionLog:
             raise ConfigurationError([f"'log': {error}"]) from error
 
     def add(self, stamp: float, decision: Any) -> str:
-        """Write one down; says what went wrong, after which no more is written: the robot drives on."""
+        """Write one down; says what went wrong, after which no more is written: the robot drives on.
+
+        Times in the file go on when those of the decisions (`stamp`, s) go back: a file has none before 0.
+        """
         if self._writer is None:
             return ""
         from sidestep.store.files import OutputError
 
+        self._ahead = max(self._ahead, self._last - stamp)
+        self._last = stamp + self._ahead
         try:
-            self._writer.onboard(stamp, decision)
+            self._writer.onboard(self._last, decision)
         except OutputError as error:
             self._writer = None
             return f"cannot be written any more: {error}"

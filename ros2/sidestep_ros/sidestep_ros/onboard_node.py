@@ -97,6 +97,7 @@ class OnboardNode(Node, abc.ABC):
         self.listen()
         patience = self._cycle.patience if self.values["trigger"] == "poses" else self._cycle.period
         self._watchdog = self.create_timer(patience, self._decide, clock=self.times.timer_clock)
+        self.times.when_set_back(self._watchdog.reset)
         self.get_logger().info(f"ready after {time.perf_counter() - began:.1f} s")
 
     def _rehearse(self) -> None:
@@ -130,8 +131,9 @@ class OnboardNode(Node, abc.ABC):
             self.complaints.add(
                 "clock", f"it went back by {self._decided_at - now:.3f} s: everything begins anew"
             )
-            self.onboard.reset()
+            # The decision core finds out for itself.
             self._robots.forget()
+            self._report_at = self._paint_at = -math.inf
         self._decided_at = now
         decision = self.onboard.decide(now)
         x, y = map(float, self.velocity_of(decision))

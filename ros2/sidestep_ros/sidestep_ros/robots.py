@@ -83,7 +83,7 @@ class Robots:
             return
         place = (pose.x, pose.y) if kind == "obstacle" else (pose.x, pose.y, pose.heading)
         reading = self._onboard.see(kind, stamp, place, index, now=self._times.now())
-        if reading.name != "ACCEPTED":
+        if not reading.used:
             self._complaints.add(f"{kind} {index}", reading.value)
             return
         if kind == "evader":

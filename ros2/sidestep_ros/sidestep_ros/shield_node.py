@@ -36,15 +36,16 @@ class ShieldNode(OnboardNode):
         except UnusableMessageError as error:
             self.complaints.add("nominal", str(error))
             return
-        reading = self.onboard.nominal(stamp, velocity)
-        if reading.name != "ACCEPTED":
+        reading = self.onboard.nominal(stamp, velocity, now=self.times.now())
+        if not reading.used:
             self.complaints.add("nominal", reading.value)
             return
         self._turning = (stamp, turn_rate)
 
     def turn_rate_at(self, now: float) -> float:
         when, turn_rate = self._turning
-        return turn_rate if now - when <= self.values["nominal_timeout"] else 0.0
+        # Of either sign: the clock may have gone back since.
+        return turn_rate if abs(now - when) <= self.values["nominal_timeout"] else 0.0
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,9 +1,11 @@
 """What time is it, for poses, for the control cycle, and for what a stamp says?"""
 
 import time
+from collections.abc import Callable
 
-from rclpy.clock import Clock
+from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 from sidestep_ros.messages import NANOSECONDS, UnusableMessageError
@@ -34,6 +36,18 @@ class Times:
     def of_cycle(self) -> float:
         """The time (s, from anywhere) that the control cycle goes by."""
         return self.now() if self._simulated else time.monotonic()
+
+    def when_set_back(self, act: Callable[[], None]) -> None:
+        """Call `act` whenever a simulated clock goes back.
+
+        A timer on it must be reset then: rcl does so by itself only for a timer that ran out after the time
+        to which the clock goes back, not for one that poses have always reset before.
+        """
+        # Kept for as long as the node is there.
+        self._jumps = self._ros.create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False),
+            post_callback=lambda jump: act(),
+        )
 
     def of_stamp(self, nanoseconds: int) -> float:
         """The time (s) of which a message with this stamp speaks, as the parameter `stamps` says.

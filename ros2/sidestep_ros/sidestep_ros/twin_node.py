@@ -151,7 +151,8 @@ class TwinNode(Node):
         if passed <= 0.0 or not self._counts["commands"]:
             return
         when, velocity, turn_rate = self._command
-        if now - when > self.values["command_timeout"]:
+        # A simulated clock may have gone back since.
+        if not 0.0 <= now - when <= self.values["command_timeout"]:
             velocity, turn_rate = (0.0, 0.0), 0.0
         self._physics.command(velocity, turn_rate, self._wheels)
         contacts = self._physics.advance(passed)

@@ -34,15 +34,16 @@ class Seen(NamedTuple):
 
     def world(self) -> World:
         """As the rest of the package knows it."""
-        return World(
-            self.evader,
-            self.pursuers,
-            self.obstacles,
-            self.target,
-            np.float64(self.time),
-            evader_velocity=self.velocity,
-            wheel_speeds=self.wheel_speeds,
-        )
+        with np.errstate(over="ignore"):  # As in `Answering`.
+            return World(
+                self.evader,
+                self.pursuers,
+                self.obstacles,
+                self.target,
+                np.float64(self.time),
+                evader_velocity=self.velocity,
+                wheel_speeds=self.wheel_speeds,
+            )
 
 
 class Answer(NamedTuple):
@@ -107,7 +108,9 @@ class Answering:
         """What was decided, and the next memory. `delay` (s) replaces the budget's."""
         parts = (*world, wished, ask, flee, delay)
         numbers = np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in parts])
-        vector, memory = self._compiled(self._arrays, numbers.astype(real(0.0).dtype), memory)
+        with np.errstate(over="ignore"):  # Infinite is what it is then, and no answer follows from it.
+            numbers = numbers.astype(real(0.0).dtype)
+        vector, memory = self._compiled(self._arrays, numbers, memory)
         return Answer.of(np.asarray(vector, np.float64), self._count), memory
 
 

@@ -73,6 +73,11 @@ class OnboardSettings:
         if wrong:
             raise ValueError("onboard settings: " + "; ".join(wrong))
 
+    def forgotten_after(self, period: float) -> float:
+        """For how long (s) motions, sides and plans may go without a pose or a decision before they say
+        nothing any more: a second, or `stale_after` or four control periods (s) if that is more."""
+        return max(1.0, self.stale_after, 4.0 * period)
+
     @property
     def response(self) -> float:
         """From a decision to when its command acts, s."""

@@ -31,6 +31,10 @@ class Track(abc.ABC):
     stamp: float | None = None
     """When the last pose that was taken was true, s."""
 
+    def forget(self) -> None:
+        """Nothing is known until the next `start`."""
+        self.stamp = None
+
     @abc.abstractmethod
     def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
         """Forget everything and begin with this pose: x, y (m) and, where there is one, heading (rad)."""
@@ -41,7 +45,7 @@ class Track(abc.ABC):
 
     @abc.abstractmethod
     def at(self, time: float) -> Float[np.ndarray, "d"]:
-        """Where the robot should be at a time (s) at or after `stamp`: x, y, heading."""
+        """Where the robot should be at a time (s): x, y, heading; at `stamp` for a time before that."""
 
 
 @final
@@ -70,10 +74,15 @@ class EvaderTrack(Track):
         self._velocity = np.zeros(2)
 
     def told(self, time: float, velocity: Float[np.ndarray, "2"]) -> None:
-        """A command (m/s, world axes) was given at `time` (s)."""
-        self._commands.append((time + self._delay, np.array(velocity, float)))
+        """A command (m/s, world axes) was given at `time` (s). Commands of later times, which a clock left
+        that went back, are forgotten."""
+        acts = time + self._delay
+        while self._commands and self._commands[-1][0] > acts:
+            self._commands.pop()
+        self._commands.append((acts, np.array(velocity, float)))
         # What acted before the last pose is in it.
-        while len(self._commands) > 1 and self._commands[1][0] <= (self.stamp or -math.inf):
+        known = -math.inf if self.stamp is None else self.stamp
+        while len(self._commands) > 1 and self._commands[1][0] <= known:
             self._commands.popleft()
 
     def _driven(self, begin: float, end: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
