@@ -16,6 +16,7 @@ import sidestep
 from sidestep.learning import records
 from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
+from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.policy import LearnedPolicy, write_policy
 from sidestep.learning.training import Report, TrainState, run_chunk, start
@@ -81,6 +82,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
                 "min_obstacle_clearance": tally.obstacle_clearance[i],
                 "interventions": tally.interventions[i],
                 "infeasible": tally.infeasible[i],
+                "invalid": tally.invalid[i],
                 "mean_correction": tally.correction[i] / tally.steps[i],
             }
         )
@@ -132,7 +134,8 @@ def train(
     `episodes` may be larger; `progress` is called after every chunk of `chunk` decisions.
 
     **Raises** `ValueError` for a bad argument, `RunError` when `out` already holds something and `resume` is
-    not set, or holds nothing to resume.
+    not set, or holds nothing to resume, `Diverged` when networks, losses or actions are no longer finite; the
+    newest checkpoint is then of the last chunk in which they were.
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("chunk", chunk, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
@@ -162,6 +165,7 @@ def train(
     earlier = 0.0
     if folder is not None and resume:
         state, earlier = _reopen(folder, config, state)
+        check_networks(state.learner, folder)
         metrics = records.read_metrics(folder)
     elif folder is not None:
         write_checkpoint(folder, state, wall_seconds=0.0)
@@ -169,7 +173,7 @@ def train(
     curves = None if folder is None else Curves(folder, purge_step=int(state.episodes) + 1)
     begun = saved = time.perf_counter()
     limit = jnp.asarray(episodes)
-    interrupted = False
+    interrupted, diverged = False, None
     chunk_seconds: list[tuple[int, float]] = []
 
     def summary() -> dict[str, Any]:
@@ -180,6 +184,9 @@ def train(
         while int(state.episodes) < episodes:
             chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
             reached, report = run_chunk(scenario, guard, hunter, options, state, limit, chunk)
+            diverged = divergence(report, reached.learner, len(metrics))
+            if diverged is not None:
+                break
             lines = _episode_lines(report, len(metrics))
             # One statement, so that an interrupt finds state and metrics of the same moment.
             state, metrics = reached, metrics + lines
@@ -199,12 +206,14 @@ def train(
     except KeyboardInterrupt:
         interrupted = True
     finally:
-        figures = summary()
+        figures, checkpoint = summary(), None
         if folder is not None:
             records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
-            write_checkpoint(folder, state, wall_seconds=earlier + time.perf_counter() - begun)
+            checkpoint = write_checkpoint(folder, state, wall_seconds=earlier + time.perf_counter() - begun)
             records.write_summary(folder, figures)
 
+    if diverged is not None:
+        raise Diverged(diverged, options, len(metrics), checkpoint)
     policy = LearnedPolicy(state.learner.actor, options.decision_steps)
     if folder is not None and not interrupted:
         write_policy(folder, policy)
