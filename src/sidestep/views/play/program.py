@@ -180,6 +180,8 @@ def _rows(scenario: Scenario, shield: Shield, world: World, memory: Any) -> Barr
     """The rows that the shield has just kept, pursuers first; with memory as it left it."""
     if isinstance(shield, JointShield):
         shield, memory = shield.rows_only, memory.sides
+    elif isinstance(shield, GameShield) and shield.goes_round:
+        memory = memory.sides
     barrier, kept = PursuitBarrier(), scenario
     if isinstance(shield, GameShield):
         barrier, kept = PursuitBarrier(eased=sampling_margin(scenario)), guarded(shield.scenario)
