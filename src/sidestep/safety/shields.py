@@ -266,8 +266,8 @@ class GameShield(Shield):
     begin to ask for retreat, the closer the distance stays to the best that is possible.
 
     With `goes_round=True`, which `make_shield` sets, an evader that is stuck behind an obstacle goes round it
-    (see `going_round`): rows and filter stay as they are, the nominal action is turned aside for a while. The
-    memory is then a `GameMemory`, else only its `sides`.
+    (see `going_round`): rows and filter stay as they are, the nominal action is turned aside for a while.
+    Where the scenario has obstacles the memory is then a `GameMemory`, else only its `sides`.
     """
 
     scenario: Scenario
@@ -286,12 +286,16 @@ class GameShield(Shield):
 
     def init(self, world: World) -> Any:
         sides = PursuitBarrier().remember(self.scenario, world)
-        return GameMemory(sides, jnp.zeros_like(world.evader[0])) if self.goes_round else sides
+        return GameMemory(sides, jnp.zeros_like(world.evader[0])) if self._may_be_stuck else sides
+
+    @property
+    def _may_be_stuck(self) -> bool:
+        return self.goes_round and self.scenario.obstacle_count > 0
 
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
-        if not self.goes_round:
+        if not self._may_be_stuck:
             return self._filtered(world, nominal, memory)
         kept = guarded(self.scenario, self.budget)
         nominal = jnp.asarray(nominal, world.evader.dtype)
