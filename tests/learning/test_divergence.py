@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sidestep._arrays import real
 from sidestep.learning.checkpoints import CheckpointError, list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.divergence import Diverged, broken_networks, divergence
 from sidestep.learning.records import read_metrics, read_summary
 from sidestep.learning.td3 import Losses
-from sidestep.learning.training import Report, run_chunk, start
+from sidestep.learning.training import Report, Tally, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 
@@ -33,10 +34,11 @@ def test_an_actor_that_answers_nan_is_invalid_input_in_training_too_not_a_stop(s
     after, report = run_chunk(scenario, shield, pursuer, options, warm, jnp.asarray(8), 10)
     assert not np.any(report.finite)
     # From the second episode on nothing but the spoiled actor was asked.
-    later = np.cumsum(report.ended) - np.asarray(report.ended) > 0
+    ended, invalid = np.asarray(report.ended), np.asarray(report.tally.invalid)
+    later = np.cumsum(ended) > ended
     assert np.any(later)
-    assert np.all(np.asarray(report.tally.invalid)[later] == np.asarray(report.tally.steps)[later])
-    assert np.all(np.asarray(report.tally.invalid) > 0)
+    np.testing.assert_array_equal(invalid[later], np.asarray(report.tally.steps)[later])
+    assert np.all(invalid > 0)
     # The robots went on moving with finite numbers.
     assert np.all(np.isfinite(after.world.evader))
     assert divergence(report, after.learner, 3) == (4, "the action that the actor asked for is")
@@ -81,23 +83,29 @@ def test_checkpoint_with_broken_networks_is_not_trained_on(small, tmp_path):
         small.train(out=folder, episodes=3, resume=True)
 
 
-def report_of(ended, critic=0.0, finite=True):
-    ended = np.asarray(ended)
-    blank = np.zeros(len(ended))
-    losses = Losses(blank + critic, blank, blank)
-    return Report(ended, blank, None, blank, losses, np.full(len(ended), finite))
+def report_of(ended, critic=None, finite=None):
+    """What a chunk of decisions reports in which episodes ended, critics lost and actions were like this."""
+    count, none = len(ended), jnp.zeros((), int)
+    critic = [0.0] * count if critic is None else critic
+    finite = [True] * count if finite is None else finite
+
+    def decision(ended, critic, finite):
+        losses = Losses(real(critic), real(0.0), real(0.0))
+        return Report(jnp.asarray(ended), none, Tally.init(), none, losses, jnp.asarray(finite))
+
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(decision, ended, critic, finite))
 
 
 def test_divergence_names_the_first_thing_and_the_episode_it_happened_in(small, small_run):
     learner = small_run.state.learner
     ended = [False, True, False, False, True, False]
     assert divergence(report_of(ended), learner, 7) is None
-    loss = np.array([0.0, 0.0, 0.0, np.inf, np.nan, np.nan])
+    loss = [0.0, 0.0, 0.0, np.inf, np.nan, np.nan]
     assert divergence(report_of(ended, loss), learner, 7) == (9, "the critics' loss is")
-    first = report_of(ended, loss, np.array([True, True, True, False, False, False]))
+    first = report_of(ended, loss, [True, True, True, False, False, False])
     assert divergence(first, learner, 7) == (9, "the action that the actor asked for is")
     # An episode's own last decision belongs to it.
-    loss = np.array([0.0, np.nan, np.nan, np.nan, np.nan, np.nan])
+    loss = [0.0, *[np.nan] * 5]
     assert divergence(report_of(ended, loss), learner, 0)[0] == 1
     # Losses that stay finite hide nothing.
     assert divergence(report_of(ended), spoiled(learner), 7) == (10, "the weights of the actor are")

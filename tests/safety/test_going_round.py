@@ -50,7 +50,8 @@ def scenario():
 
 
 def chase(shield, worlds):
-    """Straight for the target, all pursuers standing still: places (m), clearances (m), turns, seconds."""
+    """Straight for the target, all pursuers standing still: places (m), least clearance (m), turns,
+    whether the target was reached, and the periods that it took."""
     scenario = shield.scenario
 
     def period(carry, _):
@@ -69,7 +70,7 @@ def chase(shield, worlds):
     begin = worlds, shield.init(worlds), jnp.zeros(worlds.evader.shape[1:], bool)
     steps = round(SECONDS / 0.05)
     _, (places, least, turns, reached, driving) = jax.lax.scan(period, begin, None, length=steps)
-    return places, jnp.min(least, axis=0), turns, jnp.any(reached, axis=0), 0.05 * jnp.sum(driving, axis=0)
+    return places, jnp.min(least, axis=0), turns, jnp.any(reached, axis=0), jnp.sum(driving, axis=0)
 
 
 @pytest.fixture(scope="module")
@@ -80,30 +81,30 @@ def driven(scenario):
 
 
 def test_nobody_waits_behind_an_obstacle_and_nobody_hits_one(driven):
-    _, least, _, reached, seconds = driven
+    _, least, _, reached, periods = driven
     assert {name for name in SCENES if not reached[name]} == set()
     assert {name: value for name, value in least.items() if value < 0.0} == {}
     # 7.3 s is the way through the obstacle.
-    assert {name: value for name, value in seconds.items() if value > 22.0} == {}
+    assert {name: value for name, value in periods.items() if 0.05 * value > 22.0} == {}
 
 
 def test_sides_of_an_obstacle_are_mirror_images_and_the_middle_is_no_slower(driven):
-    places, _, turns, _, seconds = driven
+    places, _, turns, _, periods = driven
     for how_far in ("a millionth of a metre", "a millimetre"):
         left, right = (f"behind, {how_far} {side}" for side in ("left", "right"))
         np.testing.assert_allclose(places[left] * [1.0, -1.0], places[right], atol=1e-5)
         np.testing.assert_array_equal(turns[left], -turns[right])
-        assert seconds["exactly behind"] == pytest.approx(seconds[left], abs=0.5)
+        assert abs(periods["exactly behind"] - periods[left]) <= 10
     assert set(np.unique(turns["exactly behind"])) == {0.0, 1.0}
 
 
 def test_exact_middle_is_left_in_double_precision_too(x64):
     scenario = load_scenario("paper", obstacle_count=2)
     worlds = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[..., None], scene())
-    _, least, _, reached, seconds = eqx.filter_jit(chase)(make_shield("game", scenario), worlds)
+    _, least, _, reached, periods = eqx.filter_jit(chase)(make_shield("game", scenario), worlds)
     assert bool(reached[0])
     assert float(least[0]) > 0.0
-    assert float(seconds[0]) < 13.0
+    assert 0.05 * int(periods[0]) < 13.0
 
 
 @pytest.fixture(scope="module")

@@ -96,10 +96,10 @@ def divergence(report: Report, learner: Learner, done: int) -> tuple[int, str] |
     **Arguments:** `report` of a chunk of decisions, `learner` at its end, `done` episodes before it.
     """
     signs = {
-        "the action that the actor asked for is": report.finite,
-        "the critics' loss is": np.isfinite(report.losses.critic),
-        "the actor's loss is": np.isfinite(report.losses.actor),
-        "the critics' mean value is": np.isfinite(report.losses.value),
+        "the action that the actor asked for is": np.asarray(report.finite),
+        "the critics' loss is": np.isfinite(np.asarray(report.losses.critic)),
+        "the actor's loss is": np.isfinite(np.asarray(report.losses.actor)),
+        "the critics' mean value is": np.isfinite(np.asarray(report.losses.value)),
     }
     first = {words: int(np.argmin(good)) for words, good in signs.items() if not np.all(good)}
     ended = np.asarray(report.ended)
