@@ -95,7 +95,8 @@ class JointShield(Shield):
     0.15 s, as long as that stays true, before another is sought.
 
     Whatever is driven has passed the rows of `game`, pursuers first: what holds for that shield holds for
-    this one too. What the look-ahead adds towards obstacles is measured, not proved.
+    this one too. What the look-ahead adds towards obstacles is measured, not proved. Behind an obstacle that
+    it is stuck at, the nominal action is turned aside first (see `going_round`).
 
     It is run only near: `near_obstacle` and `near_pursuer` bound the clearance of the nearest obstacle and
     the pursuit barrier's value (m) up to which the rows cannot vouch on their own. Clear means `margin` (m)
