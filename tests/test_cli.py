@@ -43,6 +43,7 @@ SUMMARY_KEYS = [
     "min_obstacle_clearance",
     "intervention_rate",
     "infeasible_rate",
+    "invalid_rate",
     "mean_correction",
     "scenario",
     "shield",

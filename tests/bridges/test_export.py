@@ -17,7 +17,7 @@ from sidestep.learning.control_step import decide
 from sidestep.learning.networks import Actor
 from sidestep.learning.policy import LearnedPolicy, write_policy
 from sidestep.learning.records import create_run
-from sidestep.safety import Budget, Status, make_shield
+from sidestep.safety import Budget, GameShield, Status, make_shield
 from sidestep.world import World, load_scenario, observation_size, observe
 from sidestep.world.loading import scenario_to_dict
 
@@ -169,7 +169,7 @@ def assert_same_decisions(ours, theirs, aside, hard, speed):
 def robot(tmp_path_factory):
     """The paper's scenario with a policy, its exported policy + filter, states, and our shield's answers."""
     scenario = load_scenario("paper")
-    policy, shield = policy_for(scenario), make_shield("game", scenario)
+    policy, shield = policy_for(scenario), GameShield(scenario)
     path = tmp_path_factory.mktemp("export") / "robot.onnx"
     export_onnx(path, scenario, policy, run="a run")
     state = worlds(scenario, STATES, 0)
@@ -234,7 +234,7 @@ def test_filter_alone_with_a_budget_decides_as_the_shield_does(robots, tmp_path)
         "paper", pursuer_count=robots, obstacle_count=robots, arena_side=6.0, capture_distance=0.12
     )
     budget = Budget(position_error=0.004, heading_error=0.01, delay=0.02, tracking_error=0.005)
-    shield = make_shield("game", scenario, budget)
+    shield = GameShield(scenario, budget)
     export_onnx(tmp_path / "filter.onnx", scenario, None, what="filter", shield=shield)
     state = worlds(scenario, 20_000, 2)
     rng = np.random.default_rng(3)

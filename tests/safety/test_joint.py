@@ -352,7 +352,7 @@ def test_who_has_used_up_what_is_kept_beyond_the_distance_does_not_change_to_a_s
     ahead = (capture + spare - np.abs(across) * np.sin(angle)) / np.cos(angle)
     places = jnp.asarray(np.stack([ahead * rng.choice([-1.0, 1.0], 100), across], axis=1), float)
     others = jnp.asarray(-np.sign(across), float)
-    for shield in (make_shield("game", scenario), make_shield("joint", scenario).rows_only):
+    for shield in (GameShield(scenario), make_shield("joint", scenario).rows_only):
 
         def answer(place, other, shield=shield):
             world = World(place, jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.zeros(2))

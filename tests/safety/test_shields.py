@@ -177,10 +177,10 @@ def test_a_side_is_followed_from_step_to_step(precision):
     memory = shield.init(world(0.01))
     nominal = jnp.zeros(2)
     result, memory = call(world(-0.002), nominal, memory)
-    assert memory[0] == 1.0
+    assert memory.sides[0] == 1.0
     assert result.status == Status.CORRECTED
     _, memory = call(world(-0.2), nominal, memory)
-    assert memory[0] == -1.0
+    assert memory.sides[0] == -1.0
 
 
 @every_shield

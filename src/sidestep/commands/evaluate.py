@@ -137,6 +137,8 @@ def evaluation_table(evaluation: Evaluation) -> Any:
         f"shield corrects {figures['intervention_rate']:.1%} of steps, cannot satisfy all rows in "
         f"{figures['infeasible_rate']:.2%}"
     )
+    if figures["invalid_rate"]:
+        table.caption += f", was given numbers that are not finite in {figures['invalid_rate']:.2%}"
     if figures["pursuer_invalid"]:
         table.caption += "; " + stood_still(figures["pursuer_invalid"], figures["pursuer_invalid_episodes"])
     return table

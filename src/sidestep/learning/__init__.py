@@ -1,5 +1,6 @@
 """What the evader learns: TD3, replay, the training loop, checkpoints, the policy it leaves."""
 
+from sidestep.learning.divergence import Diverged
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.policy import LearnedPolicy, load_policy
 from sidestep.learning.td3 import TD3
@@ -7,6 +8,7 @@ from sidestep.learning.train import Progress, Training, resume_settings, train
 
 __all__ = [
     "TD3",
+    "Diverged",
     "LearnedPolicy",
     "Progress",
     "Training",

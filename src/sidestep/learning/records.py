@@ -177,8 +177,10 @@ def summarise(
     **Returns** counts per outcome, `safe_episodes` (neither captured nor collided), `env_steps` (control
     periods simulated), `converged_episode`, `final_return` (mean of the last 20 episodes, of all if fewer),
     the smallest clearances (m), and the shares of control periods in which the shield corrected the action
-    (`intervention_rate`) or could not satisfy its rows (`infeasible_rate`), and how far it changed the
-    velocity on average over all of them (`mean_correction`, m/s). What needs an episode is null without one.
+    (`intervention_rate`), could not satisfy its rows (`infeasible_rate`) or was given numbers that are not
+    finite (`invalid_rate`), and how far it changed the velocity on average over all of them
+    (`mean_correction`, m/s). What needs an episode is null without one, and so is `invalid_rate` where
+    episodes of an earlier version did not count those periods.
     """
     counts = {name: sum(episode["outcome"] == name for episode in metrics) for name in OUTCOMES}
     if sum(counts.values()) != len(metrics):
@@ -209,6 +211,7 @@ def summarise(
             "min_obstacle_clearance": smallest("min_obstacle_clearance"),
             "intervention_rate": share("interventions"),
             "infeasible_rate": share("infeasible"),
+            "invalid_rate": share("invalid") if all("invalid" in line for line in metrics) else None,
             "mean_correction": correction / steps if steps else None,
             **about,
         }

@@ -19,6 +19,7 @@ from sidestep._arrays import seed_number, whole_number
 from sidestep.learning import records
 from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
+from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.policy import LearnedPolicy, write_policy
 from sidestep.learning.training import Report, TrainState, run_chunk, start
@@ -85,6 +86,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
                 "min_obstacle_clearance": tally.obstacle_clearance[i],
                 "interventions": tally.interventions[i],
                 "infeasible": tally.infeasible[i],
+                "invalid": tally.invalid[i],
                 "mean_correction": tally.correction[i] / tally.steps[i],
             }
         )
@@ -137,8 +139,9 @@ def train(
     `episodes` may be larger; `progress` is called after every chunk of `chunk` decisions.
 
     **Raises** `ValueError` for a bad argument, `RunError` when `out` already holds something and `resume` is
-    not set, or holds nothing to resume, and `OutputError` when the run cannot be written any more: the newest
-    checkpoint stays, and the run can be resumed from it.
+    not set, or holds nothing to resume, `OutputError` when the run cannot be written any more, and `Diverged`
+    when networks, losses or actions are no longer finite. The newest checkpoint stays then, of the last chunk
+    in which all was well, and the run can be resumed from it.
     """
     whole_number("episodes", episodes), whole_number("chunk", chunk), seed_number(seed)
     options = make_options() if options is None else options
@@ -163,6 +166,7 @@ def train(
     earlier = 0.0
     if folder is not None and resume:
         state, earlier = _reopen(folder, config, state)
+        check_networks(state.learner, folder)
         metrics = records.read_metrics(folder)
     elif folder is not None:
         write_checkpoint(folder, state, wall_seconds=0.0)
@@ -170,7 +174,7 @@ def train(
     curves = None if folder is None else Curves(folder, purge_step=int(state.episodes) + 1)
     begun = saved = time.perf_counter()
     limit = jnp.asarray(episodes)
-    interrupted = False
+    interrupted, diverged = False, None
     chunk_seconds: list[tuple[int, float]] = []
 
     def summary() -> dict[str, Any]:
@@ -182,6 +186,9 @@ def train(
             _interrupts.check()
             chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
             reached, report = run_chunk(scenario, guard, hunter, options, state, limit, chunk)
+            diverged = divergence(report, reached.learner, len(metrics))
+            if diverged is not None:
+                break
             lines = _episode_lines(report, len(metrics))
             # One statement, so that an interrupt finds state and metrics of the same moment.
             state, metrics = reached, metrics + lines
@@ -208,26 +215,29 @@ def train(
             if isinstance(error, OutputError):
                 raise error.and_kept(_kept(folder)) from error.__cause__
         raise
-    figures = summary()
+    figures, checkpoint = summary(), None
 
     policy = LearnedPolicy(state.learner.actor, options.decision_steps)
     if folder is not None:
         try:
-            _keep(folder, metrics, state, earlier + time.perf_counter() - begun, figures)
-            if not interrupted:
+            checkpoint = _keep(folder, metrics, state, earlier + time.perf_counter() - begun, figures)
+            if not interrupted and diverged is None:
                 write_policy(folder, policy)
         except OutputError as error:
             raise error.and_kept(_kept(folder)) from error.__cause__
+    if diverged is not None:
+        raise Diverged(diverged, options, len(metrics), checkpoint)
     return Training(policy, figures, metrics, state, interrupted, folder, chunk_seconds)
 
 
 def _keep(
     folder: Path, metrics: list[dict[str, Any]], state: TrainState, seconds: float, figures: dict[str, Any]
-) -> None:
-    """Bring the run's files up to this state."""
+) -> Path:
+    """Bring the run's files up to this state; its checkpoint."""
     records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
-    write_checkpoint(folder, state, wall_seconds=seconds)
+    checkpoint = write_checkpoint(folder, state, wall_seconds=seconds)
     records.write_summary(folder, figures)
+    return checkpoint
 
 
 def _kept(folder: Path) -> str:

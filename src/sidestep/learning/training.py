@@ -11,16 +11,17 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, Flag, Scalar, real
 from sidestep.learning.bounds import on_disc, through_shield
-from sidestep.learning.control_step import RUNNING, control_step, outcome_of
+from sidestep.learning.control_step import RUNNING, control_step, nominal_velocity, outcome_of
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Learner, Losses, update
 from sidestep.safety.status import Status
-from sidestep.world import Scenario, World, observation_size, observe, to_velocity
+from sidestep.world import Scenario, World, observation_size, observe
 
 
 class Tally(eqx.Module):
-    """What one episode has come to so far. Clearances in m, correction in m/s summed over periods."""
+    """What one episode has come to so far. Clearances in m, correction in m/s summed over periods; periods
+    that the shield corrected, those of them with rows that could not hold, and with input not finite."""
 
     total_reward: Scalar
     steps: Count
@@ -28,12 +29,13 @@ class Tally(eqx.Module):
     obstacle_clearance: Scalar
     interventions: Count
     infeasible: Count
+    invalid: Count
     correction: Scalar
 
     @classmethod
     def init(cls) -> Tally:
         zero, count, far = real(0.0), jnp.zeros((), int), real(jnp.inf)
-        return cls(zero, count, far, far, count, count, zero)
+        return cls(zero, count, far, far, count, count, count, zero)
 
 
 class TrainState(eqx.Module):
@@ -51,13 +53,15 @@ class TrainState(eqx.Module):
 
 
 class Report(eqx.Module):
-    """What one decision reports to the host: the tally, which is an episode's when `ended`."""
+    """What one decision reports to the host: the tally, which is an episode's when `ended`; whether the
+    action asked for was `finite`."""
 
     ended: Bool[Array, "..."]
     outcome: Int[Array, "..."]
     tally: Tally
     env_steps: Int[Array, "..."]
     losses: Losses
+    finite: Bool[Array, "..."]
 
 
 class _Drive(eqx.Module):
@@ -134,6 +138,7 @@ def _drive(
                 obstacle_clearance=jnp.minimum(tally.obstacle_clearance, events.obstacle_clearance),
                 interventions=tally.interventions + (result.status != Status.OK).astype(tally.steps.dtype),
                 infeasible=tally.infeasible + (result.status == Status.INFEASIBLE).astype(tally.steps.dtype),
+                invalid=tally.invalid + (result.status == Status.INVALID).astype(tally.steps.dtype),
                 correction=tally.correction + result.intervention,
             ),
             alive=~(events.terminated | events.truncated),
@@ -208,7 +213,7 @@ def decide_and_learn(
     explored = jnp.clip(wanted + noise, -1.0, 1.0)
     anything = jax.random.uniform(random_key, (2,), dtype=float, minval=-1.0, maxval=1.0)
     warm = state.decisions < options.warmup_decisions
-    nominal = to_velocity(scenario, state.world, jnp.where(warm, anything, explored))
+    nominal = nominal_velocity(scenario, state.world, jnp.where(warm, anything, explored))
 
     end, path = _drive(scenario, shield, pursuer, options, state, nominal, drive_key)
     periods = end.steps.astype(nominal.dtype)
@@ -265,7 +270,12 @@ def decide_and_learn(
         is_leaf=lambda leaf: leaf is None,
     )
     report = Report(
-        ended=ended & active, outcome=end.outcome, tally=end.tally, env_steps=env_steps, losses=losses
+        ended=ended & active,
+        outcome=end.outcome,
+        tally=end.tally,
+        env_steps=env_steps,
+        losses=losses,
+        finite=~active | jnp.all(jnp.isfinite(nominal)),
     )
     return state, report
 

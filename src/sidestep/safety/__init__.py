@@ -19,6 +19,7 @@ from sidestep.safety.joint import JointShield
 from sidestep.safety.probe import BarrierProbe, BarrierWarning, probe_barrier
 from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.shields import (
+    GameMemory,
     GameShield,
     NoShield,
     PaperShield,
@@ -43,6 +44,7 @@ __all__ = [
     "Certificate",
     "DistanceValue",
     "FrameBarrier",
+    "GameMemory",
     "GameShield",
     "JointShield",
     "NoShield",

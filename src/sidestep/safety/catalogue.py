@@ -51,12 +51,13 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         if name in BUDGETED:
             _announce_beyond(guarded)
         return AdaptedShield(scenario, make_shield(name, guarded, budget))
-    if budget is None:
-        return SHIELDS[name](scenario)
-    if name not in BUDGETED:
-        raise ValueError(f"the shield {name!r} keeps no budget; use 'game' or 'joint'")
-    budget.announce(scenario)
-    return BUDGETED[name](scenario, budget=budget)
+    if budget is not None:
+        if name not in BUDGETED:
+            raise ValueError(f"the shield {name!r} keeps no budget; use 'game' or 'joint'")
+        budget.announce(scenario)
+    if name == "game":
+        return GameShield(scenario, budget, goes_round=True)
+    return SHIELDS[name](scenario) if budget is None else BUDGETED[name](scenario, budget=budget)
 
 
 def _announce_beyond(guarded: Scenario) -> None:

@@ -13,8 +13,10 @@ from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, select
 from sidestep.pursuit import Pursuer, make_pursuer, pursue
 from sidestep.safety.budget import Budget
 from sidestep.safety.by_need import by_need
+from sidestep.safety.going_round import next_turn, still_turned, turned
 from sidestep.safety.look_ahead import STRETCHES, WISHES, Outlook, clearance, imagine, moved, stretch, wish
-from sidestep.safety.shields import GameShield, Shield, ShieldResult, correction
+from sidestep.safety.sampling_margin import guarded
+from sidestep.safety.shields import GameShield, Shield, ShieldResult, as_turned, correction
 from sidestep.safety.status import Status
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -39,7 +41,8 @@ class JointMemory(eqx.Module):
     `sides (m,)` of the pursuit barrier; `way (stretches,)` the way out that it counts on, if `counts`,
     followed for `age` (s); `pause` the time (s) for which no other is sought; `expected (models, m, 2)` the
     wheel speeds (m/s) that each model would have driven last, and `surprise (models,)` by how much it was
-    wrong of late, as a share of the wheel speed; `calls ()` so far; whether it `looked` ahead last time.
+    wrong of late, as a share of the wheel speed; `calls ()` so far; whether it `looked` ahead last time; the
+    `turn ()` that leads it round an obstacle, see `going_round`.
     """
 
     sides: Float[Array, "m"]
@@ -51,6 +54,7 @@ class JointMemory(eqx.Module):
     surprise: Float[Array, "models"]
     calls: Int[Array, ""]
     looked: Flag
+    turn: Scalar
 
 
 class _Decision(eqx.Module):
@@ -91,7 +95,8 @@ class JointShield(Shield):
     0.15 s, as long as that stays true, before another is sought.
 
     Whatever is driven has passed the rows of `game`, pursuers first: what holds for that shield holds for
-    this one too. What the look-ahead adds towards obstacles is measured, not proved.
+    this one too. What the look-ahead adds towards obstacles is measured, not proved. Behind an obstacle that
+    it is stuck at, the nominal action is turned aside first (see `going_round`).
 
     It is run only near: `near_obstacle` and `near_pursuer` bound the clearance of the nearest obstacle and
     the pursuit barrier's value (m) up to which the rows cannot vouch on their own. Clear means `margin` (m)
@@ -140,16 +145,32 @@ class JointShield(Shield):
             surprise=jnp.zeros(count, world.evader.dtype),
             calls=jnp.zeros((), jnp.int32),
             looked=jnp.zeros((), bool),
+            turn=jnp.zeros_like(world.time),
         )
 
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory
     ) -> tuple[ShieldResult, JointMemory]:
+        kept = guarded(self.scenario, self.budget)
+        nominal = jnp.asarray(nominal, world.evader.dtype)
+        turn = still_turned(kept, world, nominal, memory.turn)
+        result, after, accepted = self._filtered(world, nominal, turn, memory)
+        # What the look-ahead avoids is not what it is stuck behind.
+        moved_on = ~accepted | (result.status == Status.INVALID)
+        turn = jnp.where(moved_on, 0.0, next_turn(kept, world, nominal, result.action, turn))
+        return result, eqx.tree_at(lambda memory: memory.turn, after, turn.astype(memory.turn.dtype))
+
+    def _filtered(
+        self, world: World, nominal: Float[Array, "2"], turn: Scalar, memory: JointMemory
+    ) -> tuple[ShieldResult, JointMemory, Flag]:
+        """The answer to a nominal action that is turned aside by `turn`, the next memory, and whether that
+        action was accepted."""
         game = self._game
-        greedy, sides = game(world, nominal, memory.sides)
+        greedy, sides = game(world, turned(nominal, turn), memory.sides)
+        greedy = as_turned(greedy, nominal, turn)
         m = self.scenario.pursuer_count
         if m == 0 or m + self.scenario.obstacle_count == 1:
-            return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides)
+            return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides), jnp.ones((), bool)
         # The rows of the nearest pursuer can be kept; whether those of anything beside it can is not said.
         towards_pursuers = jnp.sort(greedy.barriers[:m])
         far = 1.0 if self.acceleration is None else jnp.where(memory.looked, _LEAVE, 1.0)
@@ -178,7 +199,6 @@ class JointShield(Shield):
         length = self.horizon / STRETCHES
         chosen = wish(self.scenario, world, held, stretch(decision.way, decision.age, length))
         evasive, evasive_sides = game(world, chosen, held)
-        nominal = jnp.asarray(nominal, chosen.dtype)
         wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
         evasive = eqx.tree_at(
             lambda result: (result.status, result.intervention),
@@ -186,7 +206,7 @@ class JointShield(Shield):
             (jnp.maximum(evasive.status, Status.CORRECTED), correction(evasive.action, wanted)),
         )
         result = select(decision.accept, greedy, evasive)
-        return result, JointMemory(
+        after = JointMemory(
             jnp.where(decision.accept, sides, evasive_sides),
             decision.way,
             decision.age + self.scenario.control_period,
@@ -196,7 +216,9 @@ class JointShield(Shield):
             surprise,
             memory.calls + 1,
             need,
+            turn,
         )
+        return result, after, decision.accept
 
     def _look(self, need: Flag, situation: _Situation) -> _Decision:
         """Whether the action may be taken, and the way out counted on or to be taken instead."""

@@ -19,6 +19,7 @@ from sidestep.safety.barriers import (
 )
 from sidestep.safety.budget import Budget
 from sidestep.safety.filter import project, project_known
+from sidestep.safety.going_round import next_turn, still_turned, turned
 from sidestep.safety.least_violation import root
 from sidestep.safety.pursuit_barrier import PursuitBarrier
 from sidestep.safety.sampling_margin import guarded, margins, sampling_margin
@@ -167,6 +168,22 @@ def correction(
     return root(x * x + y * y)
 
 
+def as_turned(
+    result: ShieldResult, nominal: Float[AnyArray, "2 *lanes"], turn: Float[AnyArray, "*lanes"]
+) -> ShieldResult:
+    """The answer for a nominal action that was turned aside, as one for the `nominal` action itself."""
+    aside = turn != 0.0
+    moved = correction(result.action, jnp.where(_finite(nominal), nominal, 0.0))
+    return eqx.tree_at(
+        lambda result: (result.status, result.intervention),
+        result,
+        (
+            jnp.where(aside, jnp.maximum(result.status, Status.CORRECTED), result.status),
+            jnp.where(aside, moved, result.intervention),
+        ),
+    )
+
+
 def _with_obstacles(
     barrier: Barrier, scenario: Scenario, world: World, memory: Float[Array, "m *lanes"]
 ) -> BarrierRows:
@@ -225,6 +242,14 @@ class PaperShield(Shield):
         return decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
 
 
+class GameMemory(eqx.Module):
+    """What `game` keeps in mind: the `sides (m,)` of the pursuers' axes that its rows follow, and the
+    `turn ()` that leads it round an obstacle, see `going_round`."""
+
+    sides: Float[Array, "m *lanes"]
+    turn: Float[Array, "*lanes"]
+
+
 @final
 class GameShield(Shield):
     """`PursuitBarrier` towards pursuers, kept before the `ObstacleBarrier` rows when not all can hold.
@@ -244,12 +269,17 @@ class GameShield(Shield):
     With a `budget` the rows also keep what measurement, delay and motors may take, see `Budget`. One that is
     more than the game leaves is kept as well as can be, as everything that cannot: the further out the rows
     begin to ask for retreat, the closer the distance stays to the best that is possible.
+
+    With `goes_round=True`, which `make_shield` sets, an evader that is stuck behind an obstacle goes round it
+    (see `going_round`): rows and filter stay as they are, the nominal action is turned aside for a while.
+    Where the scenario has obstacles the memory is then a `GameMemory`, else only its `sides`.
     """
 
     scenario: Scenario
     budget: Budget | None = None
     known_velocity: bool = eqx.field(static=True, default=False)
     wish_picks_side: bool = eqx.field(static=True, default=False)
+    goes_round: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
         if self.known_velocity and self.budget is not None:
@@ -260,9 +290,29 @@ class GameShield(Shield):
         return not self.known_velocity
 
     def init(self, world: World) -> Any:
-        return PursuitBarrier().remember(self.scenario, world)
+        sides = PursuitBarrier().remember(self.scenario, world)
+        return GameMemory(sides, jnp.zeros_like(world.evader[0])) if self._may_be_stuck else sides
+
+    @property
+    def _may_be_stuck(self) -> bool:
+        return self.goes_round and self.scenario.obstacle_count > 0
 
     def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
+        if not self._may_be_stuck:
+            return self._filtered(world, nominal, memory)
+        kept = guarded(self.scenario, self.budget)
+        nominal = jnp.asarray(nominal, world.evader.dtype)
+        turn = still_turned(kept, world, nominal, memory.turn)
+        result, sides = self._filtered(world, turned(nominal, turn), memory.sides)
+        result = as_turned(result, nominal, turn)
+        turn = jnp.where(
+            result.status == Status.INVALID, 0.0, next_turn(kept, world, nominal, result.action, turn)
+        )
+        return result, GameMemory(sides, turn.astype(memory.turn.dtype))
+
+    def _filtered(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
         if self.known_velocity:

@@ -77,6 +77,7 @@ def describe(trajectory: Trajectory) -> dict[str, Any]:
             "min_obstacle_clearance": float(events.obstacle_clearance.min()),
             "intervention_rate": float(np.mean(status != Status.OK)),
             "infeasible_rate": float(np.mean(status == Status.INFEASIBLE)),
+            "invalid_rate": float(np.mean(status == Status.INVALID)),
             "mean_correction": float(trajectory.intervention.mean()),
             "pursuer_invalid": trajectory.pursuer_invalid,
         }

@@ -36,7 +36,7 @@ def comparison_sections(summary: Mapping[str, Any]) -> list[Section]:
     **Arguments:** `summary` what `reproduce` writes to `summary.json`; nothing else is shown.
 
     **Returns** training, random starts with the learned and with the goal-seeking policy, and the test scene
-    with each.
+    with each. Periods with invalid input have a row only where there were any.
     """
     shields, paper = summary["shields"], summary["paper"]
     sections = [
@@ -79,6 +79,8 @@ def _section(
 ) -> Section:
     shown = []
     for label, show in rows:
+        if show is _invalid and not any(study[key].get("invalid_rate") for study in shields.values()):
+            continue
         try:
             paper = show(reported)
         except KeyError:
@@ -122,10 +124,15 @@ def _converged(figures: Figures) -> str:
     return "never" if episode is None else str(episode)
 
 
+def _invalid(figures: Figures) -> str:
+    return UNKNOWN if figures.get("invalid_rate") is None else _share("invalid_rate")(figures)
+
+
 _INTERFERENCE: tuple[tuple[str, Show], ...] = (
     ("periods corrected", _share("intervention_rate")),
     ("mean correction, m/s", _decimals("mean_correction", 4)),
     ("periods infeasible", _share("infeasible_rate")),
+    ("periods invalid", _invalid),
 )
 
 _CLEARANCES: tuple[tuple[str, Show], ...] = (

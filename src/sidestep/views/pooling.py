@@ -9,7 +9,7 @@ from sidestep.learning.records import OUTCOMES
 from sidestep.trials import wilson_interval
 
 _LEAST = ("min_pursuer_clearance", "min_obstacle_clearance")
-_SHARES = ("intervention_rate", "infeasible_rate", "mean_correction")
+_SHARES = ("intervention_rate", "infeasible_rate", "invalid_rate", "mean_correction")
 
 
 def pooled_evaluation(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -34,6 +34,8 @@ def pooled_evaluation(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     counted = "env_steps" if all("env_steps" in report for report in reports) else "episodes"
     weight = sum(report[counted] for report in reports)
     for name in _SHARES:
+        if any(name not in report for report in reports):
+            continue
         pooled[name] = sum(report[name] * report[counted] for report in reports) / weight
     unanswered = [report.get("pursuer_invalid") for report in reports]
     pooled["pursuer_invalid"] = sum(count or 0 for count in unanswered)

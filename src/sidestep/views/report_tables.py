@@ -80,7 +80,13 @@ def comparison(
         [shown_number(None if np.isnan(f) else float(f), 0) for f in finals],
     )
     steps = [sum(_pooled(group, "steps")) for group in groups.values()]
-    for key, name in (("interventions", "periods corrected"), ("infeasible", "periods infeasible")):
+    for key, name in (
+        ("interventions", "periods corrected"),
+        ("infeasible", "periods infeasible"),
+        ("invalid", "periods invalid"),
+    ):
+        if key == "invalid" and not any(any(_pooled(group, key)) for group in groups.values()):
+            continue
         shares = [
             sum(_pooled(g, key)) / s if s else None for g, s in zip(groups.values(), steps, strict=True)
         ]

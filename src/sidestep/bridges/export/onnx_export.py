@@ -51,7 +51,8 @@ def export_onnx(
     - `policy+filter`: the same with `target (batch, 2)` in place of `wish`
 
     The filter is that of the shield `game`: what `joint` adds, looking ahead, does not fit a small graph. It
-    answers as `GameShield` does, non-finite input included; coordinates beyond 1e15 m count as not finite.
+    answers as `GameShield(scenario)` does, non-finite input included; coordinates beyond 1e15 m count as not
+    finite. It does not go round an obstacle that the robot is stuck behind (`goes_round`).
 
     **Arguments:** `policy` is not needed for a `filter`; `shield` a `game` shield with its budget, the plain
     one by default; `run` where the policy came from, for the record.

@@ -14,6 +14,7 @@ from jaxtyping import Array
 from sidestep._arrays import real
 from sidestep.learning.control_step import control_step, decide
 from sidestep.safety import (
+    GameMemory,
     GameShield,
     JointShield,
     ObstacleBarrier,
@@ -180,6 +181,8 @@ def _rows(scenario: Scenario, shield: Shield, world: World, memory: Any) -> Barr
     """The rows that the shield has just kept, pursuers first; with memory as it left it."""
     if isinstance(shield, JointShield):
         shield, memory = shield.rows_only, memory.sides
+    if isinstance(memory, GameMemory):
+        memory = memory.sides
     barrier, kept = PursuitBarrier(), scenario
     if isinstance(shield, GameShield):
         barrier, kept = PursuitBarrier(eased=sampling_margin(scenario)), guarded(shield.scenario)
