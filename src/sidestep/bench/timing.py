@@ -60,7 +60,7 @@ def exponent(sizes: Sequence[Any], seconds: Sequence[Any]) -> float:
 
 
 _FEWEST, _NARROWEST = 3, 4.0
-"""An exponent needs so many sizes, and the largest so many times the least: else it says nothing of growth."""
+"""An exponent needs so many sizes, the largest so many times the least: else it says nothing of growth."""
 
 
 def tail(sizes: Sequence[Any], seconds: Sequence[Any]) -> list[tuple[Any, Any]]:
@@ -70,7 +70,7 @@ def tail(sizes: Sequence[Any], seconds: Sequence[Any]) -> list[tuple[Any, Any]]:
 
 
 def tail_exponent(sizes: Sequence[Any], seconds: Sequence[Any]) -> float | None:
-    """`exponent` over the `tail`; None if that has fewer than three sizes or spans less than a factor of 4."""
+    """`exponent` over the `tail`; None if that has fewer than three sizes or spans no factor of 4."""
     kept = tail(sizes, seconds)
     if len(kept) < _FEWEST or kept[-1][0] < _NARROWEST * kept[0][0]:
         return None

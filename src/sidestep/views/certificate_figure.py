@@ -51,14 +51,10 @@ def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path
     with house_style():
         # Where the pursuer wins there is no budget, and the tip would repeat the whole.
         split = not certificate.pursuer_wins
-        figure = new_figure(WIDTH, 4.4 if split else 4.0)
-        if split:
-            grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], height_ratios=[1.0, 0.36])
-            panels = [figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])]
-            key = figure.add_subplot(grid[1, :])
-        else:
-            whole, key = figure.subplots(1, 2, width_ratios=[1.3, 1.0])
-            panels = [whole]
+        figure = new_figure(WIDTH, 4.4)
+        grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], height_ratios=[1.0, 0.36])
+        places = [grid[0, 0], grid[0, 1]] if split else [grid[0, :]]
+        panels, key = [figure.add_subplot(place) for place in places], figure.add_subplot(grid[1, :])
         for axes in panels:
             _draw_sets(axes, certificate)
         _draw_pursuer_and_marks(panels[0], certificate)
@@ -67,9 +63,7 @@ def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path
             _frame_tip(panels[1], certificate)
         key.set_axis_off()
         handles, labels = panels[0].get_legend_handles_labels()
-        key.legend(
-            handles, labels, loc="center", ncols=2 if split else 1, borderaxespad=0.0, labelspacing=0.4
-        )
+        key.legend(handles, labels, loc="center", ncols=2, borderaxespad=0.0, labelspacing=0.4)
         panel_titles(
             panels,
             [f"Capture at {_wanted(certificate):g} m: {_verdict(certificate)}", "The tip ahead"][
@@ -164,8 +158,8 @@ def _outside(certificate: Certificate) -> tuple[str, str]:
     """What holds outside the sets, and its colour."""
     held, kept = _wanted(certificate), certificate.guaranteed_clearance
     if certificate.pursuer_wins:
-        nearer = f"; only within {kept:.4g} m is it never" if kept > 0.0 else ""
-        return f"captured at {held:g} m from here too{nearer}", _LOST_TEXT
+        smaller = f"\n({kept:.4g} m is kept for ever)" if kept > 0.0 else ""
+        return f"no place is safe at {held:g} m{smaller}", _LOST_TEXT
     if certificate.guaranteed:
         return "safe for ever", _SAFE_TEXT
     return (f"{kept:.4g} m is kept for ever" if kept > 0.0 else "nothing is guaranteed"), _SAFE_TEXT

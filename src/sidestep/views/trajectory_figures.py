@@ -209,7 +209,8 @@ def scene_limits(
     margin = scene_margin(scenario)
     world = world_at(trajectory, tightest_period(trajectory) if period is None else period)
     poses = np.asarray(world.pursuers)
-    poses = poses[np.linalg.norm(poses[:, :2] - np.asarray(world.evader), axis=-1) <= near]
+    # The sets of one that has just gone out of reach may still be in the picture.
+    poses = poses[np.linalg.norm(poses[:, :2] - np.asarray(world.evader), axis=-1) <= 2.0 * near]
     outlines = LevelOutlines(scenario, pursuit=shield in PURSUIT_SHIELDS)
     level = outlines.at(poses, np.asarray(world.obstacles)[:, :2], max(LEVELS))
     level = np.concatenate([level[np.isfinite(level).all(axis=1)], [low, high]])

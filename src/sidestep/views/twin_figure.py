@@ -82,12 +82,13 @@ def twin_figure(
             light_grid(axes, "y")
         pursuers.sharex(obstacles)
         pursuers.tick_params(axis="x", labelbottom=False)
-        pursuers.legend(loc="upper right", ncols=2)
+        # Beside the title, where no curve runs.
+        pursuers.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2)
         obstacles.set_xlabel("time, s")
         obstacles.set_xlim(0.0, period * max(simulation.length, twin.length))
         titles += [
-            "Distance to the nearest pursuer; black line: captured",
-            "Distance to the nearest obstacle; black line: collided",
+            "Distance to the nearest pursuer; black: captured",
+            "Distance to the nearest obstacle; black: collided",
         ]
         panel_titles([upper, lower, pursuers, obstacles], titles)
         return save(figure, path)
