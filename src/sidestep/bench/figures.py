@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from sidestep.bench.timing import tail, tail_exponent
 from sidestep.views.style import (
     BLUE,
     FAINT,
@@ -69,7 +70,8 @@ def _bars(axes: Axes, values: dict[str, float], unit: str, digits: Callable[[flo
             textcoords="offset points",
             va="center",
             fontsize=7,
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+            zorder=5,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.2},
         )
     axes.set_xlabel(unit)
     axes.margins(x=0.16)
@@ -201,6 +203,13 @@ def filter_figure(sections: dict[str, Any]) -> Any:
     return figure
 
 
+def _draw_fit(axes: Axes, points: Sequence[tuple[float, float]], power: float) -> None:
+    """The power law through the sizes it was fitted to."""
+    sizes, spent = np.log(np.asarray(points, float).T)
+    middle = np.mean(spent) + power * (sizes - np.mean(sizes))
+    axes.plot(np.exp(sizes), np.exp(middle), color=INK, linewidth=0.9, linestyle=(0, (2, 1.5)), zorder=3)
+
+
 PANELS = {
     "worlds": "Worlds side by side",
     "obstacles": "Obstacles",
@@ -220,7 +229,7 @@ Y_LABELS = {
 
 
 def scaling_figure(sections: dict[str, Any]) -> Any:
-    """Seconds against each size, with the exponents of their growth."""
+    """Seconds against each size, with the exponents of their growth, and dashed the fits that they are of."""
     return _growth(sections["scaling"], lambda point: point["seconds"], Y_LABELS, exponents=True)
 
 
@@ -249,13 +258,14 @@ def _growth(
         for case, colour, marker in zip(curves, CURVE_COLOURS, MARKERS, strict=False):
             points = [point for point in case["points"] if point["size"] > 0]
             which = case["name"].partition(", ")[2]
-            power = case["exponent"]
-            growth = f"exponent {power:.2f}" if exponents and power is not None else ""
+            # Not the one in the file: what is enough for a fit is decided in one place.
+            sizes, spent = [p["size"] for p in points], [quantity(p) for p in points]
+            power = tail_exponent(sizes, spent) if exponents else None
+            growth = "" if power is None else f"exponent {power:.2f}"
             label = ": ".join(part for part in (which, growth) if part) or None
-            axes.plot(
-                [p["size"] for p in points], [quantity(p) for p in points], color=colour, marker=marker,
-                markersize=3, label=label,
-            )  # fmt: skip
+            axes.plot(sizes, spent, color=colour, marker=marker, markersize=3, label=label)
+            if power is not None:
+                _draw_fit(axes, tail(sizes, spent), power)
         axes.set_xscale("log", base=10 if kind in ("worlds", "episodes") else 2)
         if exponents:
             axes.set_yscale("log")

@@ -11,6 +11,7 @@ from sidestep._compiled import cores
 from sidestep.bench import machine
 from sidestep.bench.children import run_case
 from sidestep.bench.sections import SECTIONS, section
+from sidestep.bench.timing import tail_exponent
 
 
 def run_section(name: str, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
@@ -54,7 +55,9 @@ def in_a_line(figures: dict[str, Any]) -> str:
     if "gflops" in figures:
         parts.append(f"{figures['gflops']:.0f} GFLOP/s")
     if "points" in figures:
-        last, power = figures["points"][-1], figures["exponent"]
+        points = figures["points"]
+        last = points[-1]
+        power = tail_exponent([p["size"] for p in points], [p["seconds"] for p in points])
         parts.append(f"{len(figures['points'])} sizes to {last['size']:,}")
         parts.append("no exponent" if power is None else f"exponent {power:.2f}")
     if "cold_seconds" in figures:

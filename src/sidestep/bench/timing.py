@@ -59,8 +59,19 @@ def exponent(sizes: Sequence[Any], seconds: Sequence[Any]) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def tail_exponent(sizes: Sequence[Any], seconds: Sequence[Any]) -> float | None:
-    """`exponent` over the larger half of the sizes, where fixed costs hide no growth; None if too few."""
+_FEWEST, _NARROWEST = 3, 4.0
+"""An exponent needs so many sizes, the largest so many times the least: else it says nothing of growth."""
+
+
+def tail(sizes: Sequence[Any], seconds: Sequence[Any]) -> list[tuple[Any, Any]]:
+    """The larger half of the sizes, three at least, with their seconds: where fixed costs hide no growth."""
     points = [(size, spent) for size, spent in zip(sizes, seconds, strict=True) if size > 0 and spent > 0]
-    kept = points[-max(3, math.ceil(len(points) / 2)) :]
-    return exponent([p[0] for p in kept], [p[1] for p in kept]) if len(kept) >= 2 else None
+    return points[-max(_FEWEST, math.ceil(len(points) / 2)) :]
+
+
+def tail_exponent(sizes: Sequence[Any], seconds: Sequence[Any]) -> float | None:
+    """`exponent` over the `tail`; None if that has fewer than three sizes or spans no factor of 4."""
+    kept = tail(sizes, seconds)
+    if len(kept) < _FEWEST or kept[-1][0] < _NARROWEST * kept[0][0]:
+        return None
+    return exponent([p[0] for p in kept], [p[1] for p in kept])

@@ -166,6 +166,30 @@ def converged_episode(returns: ArrayLike) -> int | None:
     return int(closed[0]) + 1 if len(closed) else None
 
 
+def longest_convergence(returns: ArrayLike) -> tuple[int, int] | None:
+    """First and last episode, from 1, of the longest stretch whose 20-episode means are all at least 940.
+
+    Convergence is a first crossing, and a mean may fall below again. The first of several that are equally
+    long; None when no mean is that high.
+    """
+    stretches = _convergences(returns)
+    return max(stretches, key=lambda stretch: stretch[1] - stretch[0]) if stretches else None
+
+
+def stays_converged_from(returns: ArrayLike) -> int | None:
+    """Episode, from 1, from which all 20-episode means to the end of training are at least 940, if there is
+    one."""
+    stretches, last = _convergences(returns), np.size(returns)
+    return stretches[-1][0] if stretches and stretches[-1][1] == last else None
+
+
+def _convergences(returns: ArrayLike) -> list[tuple[int, int]]:
+    """First and last episode of every stretch with means of at least 940, in order."""
+    reached = moving_mean(returns) >= CONVERGENCE_RETURN
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], reached, [False]]).astype(int)))
+    return [(int(begin) + 1, int(end)) for begin, end in edges.reshape(-1, 2)]
+
+
 def summarise(
     metrics: Sequence[Mapping[str, Any]], *, wall_seconds: float | int, **about: Any
 ) -> dict[str, Any]:
@@ -175,7 +199,9 @@ def summarise(
     `version`, put in as they are.
 
     **Returns** counts per outcome, `safe_episodes` (neither captured nor collided), `env_steps` (control
-    periods simulated), `converged_episode`, `final_return` (mean of the last 20 episodes, of all if fewer),
+    periods simulated), `converged_episode` (a first crossing, see there), `converged_stays_from` and
+    `converged_longest` (see `stays_converged_from`, `longest_convergence`), `final_return` (mean of the last
+    20 episodes, of all if fewer),
     the smallest clearances (m), and the shares of control periods in which the shield corrected the action
     (`intervention_rate`), could not satisfy its rows (`infeasible_rate`) or was given numbers that are not
     finite (`invalid_rate`), and how far it changed the velocity on average over all of them
@@ -206,6 +232,8 @@ def summarise(
             "env_steps": metrics[-1].get("env_steps", steps) if metrics else 0,
             "wall_seconds": wall_seconds,
             "converged_episode": converged_episode(returns),
+            "converged_stays_from": stays_converged_from(returns),
+            "converged_longest": longest_convergence(returns),
             "final_return": float(np.mean(returns[-CONVERGENCE_WINDOW:])) if returns else None,
             "min_pursuer_clearance": smallest("min_pursuer_clearance"),
             "min_obstacle_clearance": smallest("min_obstacle_clearance"),

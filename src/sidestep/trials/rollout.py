@@ -199,6 +199,12 @@ def load_trajectory(path: str | Path) -> Trajectory:
     return load_episode(path).trajectory
 
 
+def _without_code(scenario: Mapping[str, Any]) -> dict[str, Any]:
+    models = ("evader_model", "pursuer_model")
+    nameless = {name: None for name in models if not isinstance(scenario.get(name), Mapping)}
+    return {**scenario, **nameless}
+
+
 def load_episode(path: str | Path) -> Episode:
     """What `save_trajectory` wrote, with what it was told. **Raises** as `load_trajectory`."""
     try:
@@ -212,9 +218,9 @@ def load_episode(path: str | Path) -> Episode:
             events=Events(**{name.removeprefix("events."): values for name, values in events.items()}),
             **arrays,
         )
-        # Robots of one's own are code, and what was recorded needs none of it.
-        built_in = {"evader_model": None, "pursuer_model": None}
-        scenario = load_scenario("paper", **told["scenario"] | built_in) if told else None
+        # Custom robots that have no name are code, and what was recorded needs none of it. Those with a name
+        # are kept: the sets that figures draw depend on them.
+        scenario = load_scenario("paper", **_without_code(told["scenario"])) if told else None
         return Episode(trajectory, scenario, told.get("about", {}))
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} holds no recorded trajectory: {error}") from error

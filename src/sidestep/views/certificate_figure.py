@@ -29,6 +29,8 @@ from sidestep.views.style import (
     save,
 )
 
+_SAFE, _LOST = "#EAF5F0", "#FBEDE4"
+_SAFE_TEXT, _LOST_TEXT = "#006B4E", "#9C4400"
 _PARTS = (
     ("position", "+ position error", YELLOW),
     ("heading", "+ heading error", ORANGE),
@@ -43,25 +45,38 @@ def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path
     """The capture set, the same grown by each part of the budget, and the safe set. Writes PNG and PDF.
 
     a: all of it around the pursuer, with the usable part of the capture circle and the stand-off points
-    +-b cot S; b: the tip, where margins of millimetres can be seen. Returns the paths.
+    +-b cot S; b: the tip, where margins of millimetres can be seen. Where the pursuer wins, one panel: no
+    place is safe, so none is tinted as safe. Returns the paths.
     """
     with house_style():
+        # Where the pursuer wins there is no budget, and the tip would repeat the whole.
+        split = not certificate.pursuer_wins
         figure = new_figure(WIDTH, 4.4)
         grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], height_ratios=[1.0, 0.36])
-        whole, tip = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-        key = figure.add_subplot(grid[1, :])
-        for axes in (whole, tip):
+        places = [grid[0, 0], grid[0, 1]] if split else [grid[0, :]]
+        panels, key = [figure.add_subplot(place) for place in places], figure.add_subplot(grid[1, :])
+        for axes in panels:
             _draw_sets(axes, certificate)
-        _draw_pursuer_and_marks(whole, certificate)
-        _frame_whole(whole, certificate)
-        _frame_tip(tip, certificate)
+        _draw_pursuer_and_marks(panels[0], certificate)
+        _frame_whole(panels[0], certificate)
+        if split:
+            _frame_tip(panels[1], certificate)
         key.set_axis_off()
-        handles, labels = whole.get_legend_handles_labels()
+        handles, labels = panels[0].get_legend_handles_labels()
         key.legend(handles, labels, loc="center", ncols=2, borderaxespad=0.0, labelspacing=0.4)
-        verdict = "guaranteed" if certificate.guaranteed else "not guaranteed"
-        titles = [f"Capture at {_wanted(certificate):g} m: {verdict}", "The tip ahead"]
-        panel_titles([whole, tip], titles)
+        panel_titles(
+            panels,
+            [f"Capture at {_wanted(certificate):g} m: {_verdict(certificate)}", "The tip ahead"][
+                : len(panels)
+            ],
+        )
         return save(figure, path)
+
+
+def _verdict(certificate: Certificate) -> str:
+    if certificate.pursuer_wins:
+        return "from everywhere"
+    return "excluded for ever" if certificate.guaranteed else "not guaranteed"
 
 
 def _wanted(certificate: Certificate) -> float:
@@ -91,7 +106,7 @@ def _grown(certificate: Certificate) -> list[tuple[str, str, float]]:
 
 def _draw_sets(axes: Axes, certificate: Certificate) -> None:
     angle = certificate.situation.game.usable_angle
-    axes.set_facecolor("#EAF5F0")
+    axes.set_facecolor(_LOST if certificate.pursuer_wins else _SAFE)
     light_grid(axes)
     grown = _grown(certificate)
     for label, colour, radius in reversed(grown):
@@ -139,11 +154,15 @@ def _draw_pursuer_and_marks(axes: Axes, certificate: Certificate) -> None:
         axes.plot(*certificate.start, "o", color=GREEN, markersize=5, zorder=7, label="start asked about")
 
 
-def _outside(certificate: Certificate) -> str:
+def _outside(certificate: Certificate) -> tuple[str, str]:
+    """What holds outside the sets, and its colour."""
+    held, kept = _wanted(certificate), certificate.guaranteed_clearance
+    if certificate.pursuer_wins:
+        smaller = f"\n({kept:.4g} m is kept for ever)" if kept > 0.0 else ""
+        return f"no place is safe at {held:g} m{smaller}", _LOST_TEXT
     if certificate.guaranteed:
-        return "safe for ever"
-    kept = certificate.guaranteed_clearance
-    return f"{kept:.4g} m is kept for ever" if kept > 0.0 else "nothing is guaranteed"
+        return "safe for ever", _SAFE_TEXT
+    return (f"{kept:.4g} m is kept for ever" if kept > 0.0 else "nothing is guaranteed"), _SAFE_TEXT
 
 
 def _frame_whole(axes: Axes, certificate: Certificate) -> None:
@@ -153,7 +172,8 @@ def _frame_whole(axes: Axes, certificate: Certificate) -> None:
     if certificate.start is not None and np.hypot(*certificate.start) < 4.0 * largest:
         points = np.concatenate([points, [certificate.start]])
     set_limits(axes, points, 0.08)
-    axes.text(0.02, 0.97, _outside(certificate), transform=axes.transAxes, color=GREEN, va="top", fontsize=8)
+    words, colour = _outside(certificate)
+    axes.text(0.02, 0.97, words, transform=axes.transAxes, color=colour, va="top", fontsize=8)
     axes.set_xlabel("ahead of the pursuer, m")
     axes.set_ylabel("left of it, m")
 

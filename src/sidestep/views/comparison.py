@@ -128,6 +128,19 @@ def _invalid(figures: Figures) -> str:
     return UNKNOWN if figures.get("invalid_rate") is None else _share("invalid_rate")(figures)
 
 
+def _stays_from(figures: Figures) -> str:
+    # Neither the paper nor a summary from before 0.2 says.
+    if "converged_stays_from" not in figures:
+        return UNKNOWN
+    episode = figures["converged_stays_from"]
+    return "never" if episode is None else str(episode)
+
+
+def _longest_stay(figures: Figures) -> str:
+    stay = figures.get("converged_longest")
+    return UNKNOWN if stay is None else f"{stay[0]}-{stay[1]}"
+
+
 _INTERFERENCE: tuple[tuple[str, Show], ...] = (
     ("periods corrected", _share("intervention_rate")),
     ("mean correction, m/s", _decimals("mean_correction", 4)),
@@ -145,7 +158,9 @@ _TRAINING: tuple[tuple[str, Show], ...] = (
     ("safe episodes", _count("safe_episodes")),
     ("captured", _count("captured")),
     ("collided", _count("collided")),
-    ("converged by episode", _converged),
+    ("first converged at", _converged),
+    ("  stays so from", _stays_from),
+    ("  longest stay", _longest_stay),
     ("return, mean of last 20", _decimals("final_return", 0)),
     *_INTERFERENCE,
 )

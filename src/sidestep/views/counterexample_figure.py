@@ -16,7 +16,9 @@ from sidestep.trials import Trajectory
 from sidestep.views.motion import relative
 from sidestep.views.outlines import pursuer_heights
 from sidestep.views.scene import (
+    CAPTURE_SET_LOOK,
     capture_set_outline,
+    capture_set_words,
     draw_capture_set,
     draw_evader_path,
     draw_obstacles,
@@ -142,7 +144,7 @@ def _draw_seen(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer: 
     axes.add_patch(
         Circle((0.0, 0.0), float(scenario.capture_distance), facecolor=PURSUER, alpha=0.15, linewidth=0)
     )
-    axes.plot(*outline.T, color=PURSUER, linewidth=0.9, linestyle=(0, (3, 2)), label="capture set K")
+    axes.plot(*outline.T, **CAPTURE_SET_LOOK, label=capture_set_words(scenario))
     draw_pursuer(axes, np.zeros(3), size=0.12 * span)
     axes.plot(*z.T, color=EVADER, linewidth=1.1)
     axes.plot(*z[-1], "X", color=INK, markersize=7, markeredgecolor="white", markeredgewidth=0.8, zorder=9)

@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from sidestep.trials import InterventionMap
 from sidestep.views.outlines import PURSUIT_SHIELDS
-from sidestep.views.scene import capture_set_outline, correction_colours, guarded
+from sidestep.views.scene import CAPTURE_SET_LOOK, capture_set_outline, correction_colours, guarded
 from sidestep.views.style import (
     COLUMN,
     INK,
@@ -94,9 +94,9 @@ def intervention_figure(
 
 
 def _share_colours() -> Colormap:
-    """From pale for never to dark for always; nothing white, which is for places never visited."""
+    """From light for never to dark for always, far enough from white, which is for places never visited."""
     whole = matplotlib.colormaps["YlGnBu"]
-    return LinearSegmentedColormap.from_list("share", whole(np.linspace(0.06, 0.92, 128)))
+    return LinearSegmentedColormap.from_list("share", whole(np.linspace(0.3, 1.0, 128)))
 
 
 def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -> None:
@@ -115,7 +115,7 @@ def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -
         label.set_rotation(0)
     axes.add_patch(Circle((0, 0), radius, facecolor="white", edgecolor=PURSUER, linewidth=0.8, zorder=4))
     outline = capture_set_outline(scenario)
-    axes.plot(*outline.T, color=PURSUER, linewidth=1.0, linestyle=(0, (3, 2)), zorder=5, path_effects=_HALO)
+    axes.plot(*outline.T, zorder=5, path_effects=_HALO, **CAPTURE_SET_LOOK)
     for towards in (0.0, 180.0):
         degrees = np.rad2deg(usable)
         axes.add_patch(

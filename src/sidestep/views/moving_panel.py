@@ -16,12 +16,17 @@ from matplotlib.patheffects import withStroke
 
 from sidestep.views.motion import Instant
 from sidestep.views.outlines import LevelOutlines
-from sidestep.views.scene import capture_set_outline, drawn_half_axle, to_world
+from sidestep.views.scene import (
+    CAPTURE_SET_LOOK,
+    LEVEL_COLOUR,
+    capture_set_outline,
+    drawn_half_axle,
+    to_world,
+)
 from sidestep.views.style import EVADER, INK, OBSTACLE, OUTCOME_COLOURS, PURSUER, TARGET
 from sidestep.world import Scenario
 
 NOMINAL_DASHES = (0, (2.2, 1.2))
-LEVEL_COLOUR = "#9A9A9A"
 _CIRCLE = np.array([[np.cos(angle), np.sin(angle)] for angle in np.linspace(0.0, 2.0 * np.pi, 73)])
 _ARROW_SHARE = 0.13
 _BODY = np.array([[0.75, 0.0], [-0.5, 0.5], [-0.25, 0.0], [-0.5, -0.5]])
@@ -87,7 +92,7 @@ class _Pursuer:
 
         area(self._circle, 1.0, facecolor=PURSUER, alpha=0.12, linewidth=0)
         line(self._circle, 2.0, color=PURSUER, linewidth=0.8)
-        line(self._outline, 2.6, color=PURSUER, linewidth=0.9, linestyle=(0, (3, 2)))
+        line(self._outline, 3.0, **CAPTURE_SET_LOOK)
         line(self._axle, 5.5, color=INK, linewidth=1.0)
         for wheel in self._wheels:
             area(wheel, 5.6, facecolor=INK, edgecolor="white", linewidth=0.4)

@@ -1,16 +1,19 @@
-"""Where are the levels of a barrier? Their outlines, worked out instead of searched for on a grid."""
+"""Where are the levels of a barrier? Their outlines, computed exactly instead of on a grid."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import final
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 
 from sidestep.views.motion import relative
-from sidestep.views.scene import capture_set_outline, guarded, to_world
-from sidestep.world import Scenario
+from sidestep.views.scene import LEVEL_COLOUR, LEVELS, capture_set_outline, guarded, to_world
+from sidestep.views.style import INK
+from sidestep.world import Scenario, World
 
 PURSUIT_SHIELDS = ("game", "joint")
 """Shields whose barrier towards a pursuer is that of the game; others keep a distance."""
@@ -79,6 +82,17 @@ class LevelOutlines:
             outline[~outside] = np.nan
         gap = np.full((1, 2), np.nan)
         return np.concatenate([part for outline in outlines for part in (outline, gap)])
+
+
+def draw_barrier_levels(
+    axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = LEVELS
+) -> None:
+    """Level sets of the composed barrier h = min_i h_i over evader positions, all others held in place."""
+    outlines = LevelOutlines(scenario, pursuit=pursuit)
+    poses, obstacles = np.asarray(world.pursuers), np.asarray(world.obstacles)[:, :2]
+    for level in levels:
+        axes.plot(*outlines.at(poses, obstacles, level).T, color=LEVEL_COLOUR, linewidth=0.6, zorder=0.5)
+    axes.plot(*outlines.at(poses, obstacles, 0.0).T, color=INK, linewidth=1.0, zorder=2.5)
 
 
 def _dense(outline: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:

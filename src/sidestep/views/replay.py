@@ -16,7 +16,7 @@ from markupsafe import Markup
 from sidestep.safety import Status
 from sidestep.trials import Trajectory, WorstEpisode
 from sidestep.views.html import shown_number
-from sidestep.views.scene import drawn_half_axle
+from sidestep.views.scene import drawn_half_axle, guarded
 from sidestep.views.style import OUTCOME_WORDS, shield_words
 from sidestep.world import Scenario
 
@@ -120,7 +120,7 @@ def _packed(scenario: Scenario, shield: str, episode: WorstEpisode) -> dict[str,
         "target": [round(float(value), 4) for value in np.asarray(trajectory.worlds.target)[first]],
         "arena": float(scenario.arena_side),
         "reach": float(scenario.reach_distance),
-        "numbers": {"pursuer_half_axle": drawn_half_axle(scenario)}
+        "numbers": {"pursuer_half_axle": drawn_half_axle(scenario), "capture_set": _capture_set(scenario)}
         | {
             name: float(getattr(scenario, name))
             for name in (
@@ -132,6 +132,12 @@ def _packed(scenario: Scenario, shield: str, episode: WorstEpisode) -> dict[str,
         },
         "series": packed,
     }
+
+
+def _capture_set(scenario: Scenario) -> list[float]:
+    """Radius (m) and speed ratio of the capture set that every view draws, see `capture_set_outline`."""
+    kept = guarded(scenario)
+    return [float(kept.capture_distance), min(float(kept.evader_speed / kept.pursuer_speed), 1.0)]
 
 
 def _words(trajectory: Trajectory, episode: WorstEpisode, period: float) -> str:

@@ -34,7 +34,6 @@ from sidestep.views.training_figures import (
     outcome_figure,
     reward_figure,
     safety_table,
-    shows_episodes,
 )
 from sidestep.views.trajectory_figures import scenes_figure
 from sidestep.world import Scenario
@@ -93,7 +92,6 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
             groups, {shield: scene for shield, (_, scene) in scenes.items()}, untrained_scenes
         ),
         "reward": _reward(runs, folder),
-        "shows_episodes": shows_episodes(runs),
         "several_runs": any(len(group) > 1 for group in groups.values()),
         "evaluations": evaluations,
         "untrained": untrained,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.learning.records import converged_episode
+from sidestep.learning.records import converged_episode, stays_converged_from
 from sidestep.trials import Trajectory
 from sidestep.views.html import shown_number
 from sidestep.views.runs import Run
@@ -21,12 +21,19 @@ def percent(value: float | int | None, digits: int = 1) -> str:
 
 
 def convergence(group: Sequence[Run]) -> str:
-    """Where a shield's runs converged, in words."""
-    episodes = [converged_episode([float(e["return"]) for e in run.metrics]) for run in group]
-    found = sorted(episode for episode in episodes if episode is not None)
-    if len(group) == 1:
-        return f"episode {found[0]}" if found else "never"
-    return f"{len(found)} of {len(group)} seeds" + (f", at {', '.join(map(str, found))}" if found else "")
+    """Where a shield's runs first converged, and from where they stayed so, in words."""
+    returns = [[float(e["return"]) for e in run.metrics] for run in group]
+    firsts, stays = [converged_episode(r) for r in returns], [stays_converged_from(r) for r in returns]
+    if len(group) > 1:
+        found = sorted(episode for episode in firsts if episode is not None)
+        at = f", first at {', '.join(map(str, found))}" if found else ""
+        stayed = f"; {sum(stay is not None for stay in stays)} stayed" if found else ""
+        return f"{len(found)} of {len(group)} seeds{at}{stayed}"
+    (first,), (stay,) = firsts, stays
+    if first is None:
+        return "never"
+    then = "and stayed" if stay == first else f"stayed from {stay}" if stay else "not at the end"
+    return f"at {first}, {then}"
 
 
 def card(shield: str, group: Sequence[Run], scenes: Mapping[str, tuple[Run, Trajectory]]) -> dict[str, Any]:
@@ -65,7 +72,10 @@ def comparison(
             "its 95 % bounds",
             [f"{percent(row['low'])[:-2]} to {percent(row['high'])}" for row in (paper, *safety.values())],
         ),
-        ("converged", [f"within {PAPER_CONVERGED} episodes", *(convergence(g) for g in groups.values())]),
+        (
+            "first converged",
+            [f"within {PAPER_CONVERGED} episodes", *(convergence(g) for g in groups.values())],
+        ),
     ]
 
     def add(name: str, reported: str, cells: Sequence[str]) -> None:

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
-from sidestep.safety import ObstacleBarrier, PursuitBarrier, RangeBarrier, covered, of_control_point
+from sidestep.safety import covered, of_control_point
 from sidestep.trials import Trajectory
-from sidestep.views.style import EVADER, FAINT, INK, OBSTACLE, PURSUER, TARGET
+from sidestep.views.labels import Label
+from sidestep.views.style import EVADER, FAINT, OBSTACLE, PURSUER, TARGET
 from sidestep.world import Scenario, World
 
 _MOST_MARKS = 8
 _LABEL_HALO = [withStroke(linewidth=1.8, foreground="white")]
+_RANKS = {EVADER: 0, PURSUER: 1}
+"""Whose time labels go first where there is little room."""
+CAPTURE_SET_LOOK: dict[str, Any] = {"color": PURSUER, "linewidth": 1.4, "linestyle": (0, (2.5, 2))}
+"""How the outline of the capture set K is drawn in every view."""
+LEVELS = (0.1, 0.2, 0.3)
+"""Levels of the barrier (m) that are drawn beside its level 0."""
+LEVEL_COLOUR = "#8F8F8F"
 _ROBOT = 0.07
 """Length of a drawn robot, m; sizes do not enter the problem."""
 
@@ -62,6 +70,11 @@ def capture_set_outline(scenario: Scenario, points: int = 181) -> Float[np.ndarr
     arc = radius * np.stack([np.cos(left), np.sin(left)], axis=-1)
     apex = np.array([[radius / np.cos(usable), 0.0]])
     return np.concatenate([apex, arc, -apex, -arc, apex])
+
+
+def capture_set_words(scenario: Scenario) -> str:
+    """How a key calls the outline that every view draws, that of `capture_set_outline`."""
+    return "capture set K" if scenario.evader_model is None else "capture set K of the control point"
 
 
 def to_world(points: Float[np.ndarray, "n 2"], pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 2"]:
@@ -143,7 +156,8 @@ def draw_capture_set(axes: Axes, scenario: Scenario, pose: Float[np.ndarray, "3"
         )
     )
     outline = to_world(capture_set_outline(scenario), pose)
-    axes.plot(*outline.T, color=PURSUER, linewidth=0.8, linestyle=(0, (3, 2)), zorder=2)
+    # Over the level h = 0, which has the same place around a pursuer for the shields that keep K.
+    axes.plot(*outline.T, **CAPTURE_SET_LOOK, zorder=3)
 
 
 def draw_obstacles(
@@ -196,7 +210,10 @@ def draw_time_marks(
     dots: bool = True,
     side: float = 1.0,
 ) -> None:
-    """The time in seconds, and a dot, at these control periods of a path; `side` -1 labels its right."""
+    """The time in seconds, and a dot, at these control periods of a path; `side` -1 prefers its right.
+
+    Labels that find no room are left out when the figure is saved, see `place_labels`.
+    """
     span = np.ptp(np.asarray([axes.get_xlim(), axes.get_ylim()]), axis=1).max()
     place = axes.get_subplotspec()
     # Labels keep their size when scenes stand side by side, so fewer have room.
@@ -221,10 +238,15 @@ def draw_time_marks(
         last = path[mark]
         ahead = path[min(mark + 1, len(path) - 1)] - path[max(mark - 1, 0)]
         norm = np.hypot(*ahead)
-        aside = np.array([-ahead[1], ahead[0]]) / norm if norm > 0 else np.array([0.0, 1.0])
-        axes.annotate(
-            f"{mark * period:g}", path[mark], xytext=_at(9 * side * aside), textcoords="offset points",
-            fontsize=6.5, color=colour, ha="center", va="center", zorder=8, path_effects=_LABEL_HALO,
+        along = ahead / norm if norm > 0 else np.array([1.0, 0.0])
+        aside = side * np.array([-along[1], along[0]])
+        ways = (aside, -aside, aside + along, aside - along, along - aside, -along - aside, along, -along)
+        places = [_at(far * way / np.hypot(*way)) for far in (9.0, 13.0) for way in ways]
+        axes.add_artist(
+            Label(
+                f"{mark * period:g}", _at(path[mark]), places, rank=_RANKS.get(colour, len(_RANKS)),
+                fontsize=6.5, color=colour, zorder=8, path_effects=_LABEL_HALO,
+            )
         )  # fmt: skip
 
 
@@ -241,38 +263,3 @@ def draw_evader_path(axes: Axes, trajectory: Trajectory, norm: Normalize) -> Lin
     )  # fmt: skip
     axes.add_collection(lines, autolim=False)
     return lines
-
-
-@eqx.filter_jit
-def _composed_barrier(
-    scenario: Scenario, world: World, evaders: Float[Array, "n 2"], pursuit: bool
-) -> Float[Array, "n"]:
-    barrier = PursuitBarrier() if pursuit else RangeBarrier()
-    obstacle, none = ObstacleBarrier(), jnp.zeros((), evaders.dtype)
-
-    def value(evader: Array) -> Array:
-        side = lambda robot: barrier.recall(scenario, evader, robot, None)  # noqa: E731
-        to_pursuers = jax.vmap(lambda robot: barrier.value(scenario, evader, robot, side(robot)))(
-            world.pursuers
-        )
-        to_obstacles = jax.vmap(lambda robot: obstacle.value(scenario, evader, robot, none))(world.obstacles)
-        return jnp.min(jnp.concatenate([to_pursuers, to_obstacles]))
-
-    return jax.vmap(value)(evaders)
-
-
-def draw_barrier_levels(
-    axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = (0.1, 0.2, 0.3)
-) -> None:
-    """Level sets of the composed barrier h = min_i h_i over evader positions, all others held in place."""
-    scenario, world = (
-        guarded(scenario),
-        eqx.tree_at(lambda w: w.evader_state, world, None, is_leaf=lambda leaf: leaf is None),
-    )
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    x, y = np.linspace(left, right, 160), np.linspace(bottom, top, 160)
-    grid = np.stack(np.meshgrid(x, y), axis=-1)
-    values = _composed_barrier(scenario, world, jnp.asarray(grid.reshape(-1, 2), dtype=float), pursuit)
-    heights = np.asarray(values).reshape(grid.shape[:2])
-    axes.contour(x, y, heights, levels=list(levels), colors="#9A9A9A", linewidths=0.5, zorder=0.5)
-    axes.contour(x, y, heights, levels=[0.0], colors=INK, linewidths=1.0, zorder=2.5)

@@ -18,9 +18,16 @@ from PIL import Image
 
 from sidestep.trials import Trajectory
 from sidestep.views.motion import Instant, Motion
-from sidestep.views.moving_panel import LEVEL_COLOUR, NOMINAL_DASHES, MovingPanel
+from sidestep.views.moving_panel import NOMINAL_DASHES, MovingPanel
 from sidestep.views.outlines import PURSUIT_SHIELDS
-from sidestep.views.scene import capture_set_outline, correction_colours
+from sidestep.views.scene import (
+    CAPTURE_SET_LOOK,
+    LEVEL_COLOUR,
+    LEVELS,
+    capture_set_outline,
+    capture_set_words,
+    correction_colours,
+)
 from sidestep.views.style import (
     EVADER,
     FAINT,
@@ -55,8 +62,6 @@ change, so nothing jitters."""
 _TICKS = (0.0, 0.02, 0.1, 0.5, 1.0, 2.0, 4.0)
 _WIDEST = 3.2
 """The pursuer's frame shows at most so many times the reach of its capture set."""
-LEVELS = (0.1, 0.2, 0.3)
-"""Levels of the barrier (m) that are drawn beside its level 0."""
 
 
 @final
@@ -105,7 +110,7 @@ class Stage:
             )
             strips = self._axes(_BARRIERS), self._axes(_CORRECTIONS)
             self._veils = _draw_strips(*strips, scenario, trajectory)
-            self._draw_key(len(start.obstacles) > 0, levels)
+            self._draw_key(scenario, len(start.obstacles) > 0, levels)
             self._write_words()
             self._moving: list[tuple[Axes, Artist]] = [
                 (panel.axes, artist) for panel in self._panels for artist in panel.artists
@@ -140,16 +145,16 @@ class Stage:
     def _text(self, x: float, y: float, words: str, *, size: float, **look: Any) -> Any:
         return self._figure.text(x / _INCHES[0], y / _INCHES[1], words, va="baseline", fontsize=size, **look)
 
-    def _draw_key(self, obstacles: bool, levels: Sequence[float]) -> None:
+    def _draw_key(self, scenario: Scenario, obstacles: bool, levels: Sequence[float]) -> None:
         handles: list[Any] = [
             Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
             Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
             Line2D([], [], color=TARGET, marker="*", linestyle="none", markersize=7, label="target"),
             Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
-            Line2D([], [], color=PURSUER, linewidth=0.9, linestyle=(0, (3, 2)), label="capture set K"),
+            Line2D([], [], **CAPTURE_SET_LOOK, label=capture_set_words(scenario)),
             Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
             Line2D([], [], color=EVADER, linewidth=1.5, label="velocity driven"),
-            Line2D([], [], color=INK, linewidth=1.5, linestyle=NOMINAL_DASHES, label="velocity wished"),
+            Line2D([], [], color=INK, linewidth=1.5, linestyle=NOMINAL_DASHES, label="nominal velocity"),
             Patch(facecolor=correction_colours()(0.6), label="shield corrects"),
         ]
         if levels:

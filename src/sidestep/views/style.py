@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sidestep.store.files import write_bytes
+from sidestep.views.labels import place_labels
 
 # Okabe and Ito's palette, "Color universal design" (2008).
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -151,6 +152,7 @@ def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
     """
     png, pdf = figure_files(path)
     content = b""
+    place_labels(figure)
     for dpi in (_DPI, 160, 130, 100, 75):
         content = _as_png(figure, dpi)
         if len(content) < _MOST_BYTES:
@@ -160,6 +162,7 @@ def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
     for text in figure.findobj(lambda artist: artist.get_gid() == _CAPTION):
         letter, gap, _ = text.get_text().partition("   ")  # type: ignore[attr-defined]
         text.set_text(letter if gap else "")  # type: ignore[attr-defined]
+    place_labels(figure)
     figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
     write_bytes(pdf, buffer.getvalue())
     return png, pdf

@@ -10,7 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from sidestep.learning.records import CONVERGENCE_RETURN, CONVERGENCE_WINDOW, converged_episode, moving_mean
+from sidestep.learning.records import (
+    CONVERGENCE_RETURN,
+    CONVERGENCE_WINDOW,
+    converged_episode,
+    moving_mean,
+    stays_converged_from,
+)
 from sidestep.trials import interquartile_mean, wilson_interval
 from sidestep.views.runs import Run, by_shield
 from sidestep.views.style import (
@@ -34,70 +40,64 @@ PAPER_EPISODES = 200
 _MANY_RUNS = 6
 _BESIDE = -0.19
 """Where a panel's letter stands in a column, in widths of the axes: above their labels, beside the legend."""
-_MOST_SHIELDS_WITH_EPISODES = 2
+_BAND, _HIGHEST = 0.32, 1000.0
+"""Half the height of a run's band of returns, in rows, and the return at its top."""
 
 
 def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = WIDTH) -> tuple[Path, Path]:
-    """Accumulated reward over training episodes, and below it how every episode ended.
+    """Returns over training episodes: above as means, below one by one, with how every episode ended.
 
-    Thick: mean of the last 20 episodes, and over several seeds the interquartile mean of it with the range of
-    the seeds; faint: each episode, for up to two shields (see `shows_episodes`). A diamond marks convergence
-    (mean of 20 at least 940). Writes PNG and PDF, `width` inches wide.
+    a: mean return of the last 20 episodes; over several seeds the interquartile mean of it (thick) with each
+    seed (thin) and their range. A filled diamond marks where a run first converged (mean of 20 at least 940),
+    a hollow one from where it stayed so to the end. b: the return of each episode, a row per run, clipped to
+    0 to 1000, and by marker how it ended. Writes PNG and PDF, `width` inches wide.
     """
     groups = by_shield(runs)
     rows = [run for group in groups.values() for run in group]
     with house_style():
-        row_height = 0.24 if len(rows) <= _MANY_RUNS else 0.16
-        raster_height = row_height * max(len(rows), 1) + 0.25
+        raster_height = _row_height(rows) * max(len(rows), 1) + 0.25
         # In a column there is room for the letters of the panels alone.
         narrow = width < WIDTH
         figure = new_figure(width, (2.5 if narrow else 2.9) + raster_height)
         top, raster = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, raster_height])
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = shield_colour(shield, position), shield_words(shield)
-            kind = "line" if len(groups) == 1 else "dots" if shows_episodes(runs) else "none"
-            _draw_returns(top, group, colour, words, shield_dashes(shield), episodes_as=kind)
-        titles = ["Accumulated reward per training episode", "How each episode ended"]
+            _draw_returns(top, group, colour, words, shield_dashes(shield))
+        titles = [f"Mean return of the last {CONVERGENCE_WINDOW} episodes", "Return of each episode"]
         panel_titles([top, raster], ["", ""] if narrow else titles, in_caption=True)
         _finish_returns(top, rows, narrow=narrow)
-        _draw_outcomes(raster, rows, narrow=narrow)
+        _draw_episodes(raster, rows, narrow=narrow)
         if narrow:
             raster.set_title(raster.get_title("left"), x=_BESIDE)
         return save(figure, path)
 
 
-def shows_episodes(runs: Sequence[Run]) -> bool:
-    """Whether `reward_figure` shows each episode's return, or only means.
-
-    Returns are near 0 or near 1000, so those of more than two shields would cover each other.
-    """
-    return len(by_shield(runs)) <= _MOST_SHIELDS_WITH_EPISODES
+def _row_height(runs: Sequence[Run]) -> float:
+    """Inches for the episodes of one run."""
+    return 0.4 if len(runs) <= _MANY_RUNS else 0.24
 
 
 def _returns(run: Run) -> np.ndarray:
     return np.array([float(episode["return"]) for episode in run.metrics])
 
 
-def _draw_returns(
-    axes: Axes, group: Sequence[Run], colour: str, label: str, dashes: Any, *, episodes_as: str
-) -> None:
+def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, dashes: Any) -> None:
     curves = [_returns(run) for run in group]
     several = len(group) > 1
     label += f", {len(group)} seeds" if several else ""
     for returns in curves:
-        episodes = np.arange(1, len(returns) + 1)
+        means = moving_mean(returns)
         if several:
-            axes.plot(episodes, moving_mean(returns), color=colour, alpha=0.35, linewidth=0.7)
-        elif episodes_as == "line":
-            axes.plot(episodes, returns, color=colour, alpha=0.3, linewidth=0.7)
-        elif episodes_as == "dots":
-            axes.scatter(episodes, returns, s=7, color=colour, alpha=0.45, linewidth=0)
-        closed = converged_episode(returns)
-        if closed is not None:
-            axes.plot(
-                closed, moving_mean(returns)[closed - 1], marker="D", markersize=5, color=colour,
-                markeredgecolor="white", markeredgewidth=0.8, zorder=5, linestyle="none",
-            )  # fmt: skip
+            episodes = np.arange(1, len(returns) + 1)
+            axes.plot(episodes, means, color=colour, alpha=0.35, linewidth=0.7)
+        first, stays = converged_episode(returns), stays_converged_from(returns)
+        look: dict[str, Any] = {"marker": "D", "markersize": 5, "linestyle": "none"}
+        if first is not None:
+            edge = {"color": colour, "markeredgecolor": "white", "markeredgewidth": 0.8}
+            axes.plot(first, means[first - 1], **look, **edge, zorder=5.2)
+        if stays is not None and stays != first:
+            edge = {"color": "white", "markeredgecolor": colour, "markeredgewidth": 1.3}
+            axes.plot(stays, means[stays - 1], **look, **edge, zorder=5.1)
     shortest = min(len(returns) for returns in curves)
     means = np.stack([moving_mean(returns[:shortest]) for returns in curves])
     episodes = np.arange(1, shortest + 1)
@@ -130,42 +130,55 @@ def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
             fontsize=7,
             ha="right",
         )
-    axes.set_ylabel("accumulated reward")
+    axes.set_ylabel("mean return")
+    # The words at the foot stand below every curve.
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.0) - (90.0 if longest > PAPER_CONVERGED else 0.0), max(high, 1050.0))
     axes.set_xlim(0, longest + 1)
     handles, _ = axes.get_legend_handles_labels()
-    diamond = Line2D(
-        [], [], marker="D", linestyle="none", color=INK, markersize=4.5,
-        label="converged"
-        if narrow
-        else f"converged: mean of {CONVERGENCE_WINDOW} at least {CONVERGENCE_RETURN:.0f}",
-    )  # fmt: skip
+    look: dict[str, Any] = {"marker": "D", "linestyle": "none", "markeredgecolor": INK, "markersize": 4.5}
+    words = ("first 940", "stays") if narrow else (f"first at {CONVERGENCE_RETURN:.0f}", "stays from here")
+    diamonds = [
+        Line2D([], [], **look, color=face, label=word)
+        for face, word in zip((INK, "white"), words, strict=True)
+    ]
     # Above the axes, where no curve can run.
-    in_one_row = len(handles) <= 3 and len(runs) == len(handles)
     most = 2 if narrow else 3
-    columns, rows = (4, 1) if in_one_row and not narrow else (most, len(handles) // most + 1)
+    rows = -(-(len(handles) + 2) // most)
     axes.set_title(
         axes.get_title("left"), pad=(-8.0 if narrow else 6.0) + 14.0 * rows, x=_BESIDE if narrow else 0.0
     )
     axes.legend(
-        handles=[*handles, diamond], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+        handles=[*handles, *diamonds], loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=most,
         borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5,
     ).set_in_layout(not narrow)  # fmt: skip
 
 
-def _draw_outcomes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
+def _draw_episodes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
+    """Every episode's return, in a band of its own per run, by markers for how it ended."""
     many = len(runs) > _MANY_RUNS
     for row, run in enumerate(runs):
+        places = row + _BAND * (1.0 - 2.0 * np.clip(_returns(run) / _HIGHEST, 0.0, 1.0))
+        outcomes = np.array([episode["outcome"] for episode in run.metrics], dtype=object)
+        for level in (_BAND, -_BAND):
+            axes.axhline(row + level, color="#E6E6E6", linewidth=0.6, zorder=0.5)
         for outcome, colour in OUTCOME_COLOURS.items():
-            episodes = [i + 1 for i, episode in enumerate(run.metrics) if episode["outcome"] == outcome]
-            size = {"reached": 2.5, "timed_out": 9.0}.get(outcome, 18.0) * (0.6 if many else 1.0)
+            found = np.flatnonzero(outcomes == outcome)
+            size = {"reached": 3.0, "timed_out": 9.0}.get(outcome, 13.0) * (0.6 if many else 1.0)
             axes.scatter(
-                episodes, [row] * len(episodes), s=size, marker=OUTCOME_MARKERS[outcome], color=colour,
+                found + 1, places[found], s=size, marker=OUTCOME_MARKERS[outcome], color=colour,
                 linewidth=0, zorder=3 if outcome != "reached" else 2,
             )  # fmt: skip
     several_seeds = len(runs) > len({run.shield for run in runs})
     labels = [run.shield + (f", seed {run.seed}" if several_seeds else "") for run in runs]
     axes.set_yticks(range(len(runs)), labels, fontsize=6 if many else 7.5)
-    axes.set_ylim(len(runs) - 0.4, -0.6)
+    axes.set_ylim(len(runs) - 0.45, -0.55)
+    if not many:
+        for row in range(len(runs)):
+            for level, word in ((_BAND, "0"), (-_BAND, f"{_HIGHEST:.0f}")):
+                axes.text(
+                    1.005, row + level, word, transform=axes.get_yaxis_transform(), va="center", fontsize=6
+                )
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
     axes.set_xlabel("training episode")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,10 +15,13 @@ from matplotlib.patches import Patch
 
 from sidestep.safety import Status
 from sidestep.trials import Trajectory
-from sidestep.views.outlines import PURSUIT_SHIELDS
+from sidestep.views.outlines import PURSUIT_SHIELDS, LevelOutlines, draw_barrier_levels
 from sidestep.views.scene import (
+    CAPTURE_SET_LOOK,
+    LEVEL_COLOUR,
+    LEVELS,
+    capture_set_words,
     correction_colours,
-    draw_barrier_levels,
     draw_capture_set,
     draw_evader_path,
     draw_obstacles,
@@ -35,6 +39,7 @@ from sidestep.views.style import (
     INK,
     OBSTACLE,
     OUTCOME_COLOURS,
+    OUTCOME_MARKERS,
     OUTCOME_WORDS,
     PURSUER,
     TARGET,
@@ -48,6 +53,13 @@ from sidestep.views.style import (
 )
 from sidestep.world import Scenario
 
+Limits = tuple[np.ndarray, np.ndarray]
+"""Lowest and highest x and y, m."""
+
+_ROOM = 0.08
+"""m around circles and capture sets, for labels."""
+_EDGE = 0.02
+"""m between the outermost level set and the frame."""
 _BARRIER_TICKS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.0)
 
 
@@ -73,8 +85,8 @@ def trajectory_figure(
     if moment is not None:
         period = int(np.clip(round(moment / float(scenario.control_period)), 0, trajectory.length))
     with house_style():
-        low, high = scene_extent(trajectory)
-        spans = high - low + 2 * scene_margin(scenario)
+        low, high = scene_limits(scenario, trajectory, shield=shield, period=period)
+        spans = high - low
         # As high as the scene needs at full width, within reason.
         scene_height = float(np.clip((WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
         figure = new_figure(WIDTH, scene_height + 3.75)
@@ -83,7 +95,7 @@ def trajectory_figure(
         )
         norm = correction_norm(scenario)
         draw_scene(scene, scenario, trajectory, norm, shield=shield, period=period)
-        scene_legend(key, trajectory)
+        scene_legend(key, scenario, [trajectory])
         draw_barriers(barriers, scenario, trajectory)
         draw_corrections(corrections, scenario, trajectory, norm)
         now, duration = (count * float(scenario.control_period) for count in (period, trajectory.length))
@@ -118,10 +130,10 @@ def scenes_figure(
     """
     with house_style():
         norm = correction_norm(scenario)
-        extents = [scene_extent(trajectory) for trajectory in trajectories.values()]
-        low = np.min([extent[0] for extent in extents], axis=0)
-        high = np.max([extent[1] for extent in extents], axis=0)
-        spans = high - low + 2 * scene_margin(scenario)
+        low, high = common_limits(
+            scene_limits(scenario, trajectory, shield=shield) for shield, trajectory in trajectories.items()
+        )
+        spans = high - low
         # Two columns from three scenes on: one below the other they would not fit a page.
         count, columns = len(trajectories), 1 if len(trajectories) <= 2 else 2
         rows = -(-count // columns)
@@ -144,7 +156,7 @@ def scenes_figure(
             if index % columns:
                 one.set_ylabel("")
                 one.tick_params(labelleft=False)
-        scene_legend(key, next(iter(trajectories.values())))
+        scene_legend(key, scenario, list(trajectories.values()))
         bar = figure.colorbar(
             ScalarMappable(norm, correction_colours()), ax=[*axes, key], shrink=0.4, aspect=25, pad=0.015
         )
@@ -161,7 +173,7 @@ def correction_norm(scenario: Scenario) -> Normalize:
 
 def scene_margin(scenario: Scenario) -> float:
     """Room (m) around everything that moved, for the circles around robots."""
-    return max(float(scenario.capture_distance), float(scenario.collision_distance)) + 0.08
+    return max(float(scenario.capture_distance), float(scenario.collision_distance)) + _ROOM
 
 
 def scene_extent(trajectory: Trajectory, near: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
@@ -181,6 +193,39 @@ def scene_extent(trajectory: Trajectory, near: float = np.inf) -> tuple[np.ndarr
     return points.min(axis=0), points.max(axis=0)
 
 
+def scene_limits(
+    scenario: Scenario,
+    trajectory: Trajectory,
+    *,
+    shield: str = "",
+    period: int | None = None,
+    near: float = np.inf,
+) -> Limits:
+    """Lowest and highest x and y (m) of a scene with all that `draw_scene` puts into it: paths, circles,
+    and the level sets at control period `period` (the tightest if not given), none cut. Pursuers count
+    only where they are within `near` (m) of the evader.
+    """
+    low, high = scene_extent(trajectory, near)
+    margin = scene_margin(scenario)
+    world = world_at(trajectory, tightest_period(trajectory) if period is None else period)
+    poses = np.asarray(world.pursuers)
+    # The sets of one that has just gone out of reach may still be in the picture.
+    poses = poses[np.linalg.norm(poses[:, :2] - np.asarray(world.evader), axis=-1) <= 2.0 * near]
+    outlines = LevelOutlines(scenario, pursuit=shield in PURSUIT_SHIELDS)
+    level = outlines.at(poses, np.asarray(world.obstacles)[:, :2], max(LEVELS))
+    level = np.concatenate([level[np.isfinite(level).all(axis=1)], [low, high]])
+    return (
+        np.minimum(low - margin, level.min(axis=0) - _EDGE),
+        np.maximum(high + margin, level.max(axis=0) + _EDGE),
+    )
+
+
+def common_limits(limits: Iterable[Limits]) -> Limits:
+    """The smallest limits that hold all of these."""
+    lows, highs = zip(*limits, strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
 def draw_scene(
     axes: Axes,
     scenario: Scenario,
@@ -189,13 +234,15 @@ def draw_scene(
     *,
     shield: str = "",
     period: int | None = None,
-    limits: tuple[np.ndarray, np.ndarray] | None = None,
+    limits: Limits | None = None,
 ) -> None:
-    """Everything that moved, with time marks; capture and level sets at control period `period`."""
+    """Everything that moved, with time marks and a mark where it ended; capture and level sets at control
+    period `period`."""
     period = tightest_period(trajectory) if period is None else period
     world = world_at(trajectory, period)
-    corners = limits if limits is not None else scene_extent(trajectory)
-    set_limits(axes, np.stack(corners), scene_margin(scenario))
+    if limits is None:
+        limits = scene_limits(scenario, trajectory, shield=shield, period=period)
+    set_limits(axes, np.stack(limits), 0.0)
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     draw_barrier_levels(axes, scenario, world, pursuit=shield in PURSUIT_SHIELDS)
@@ -221,36 +268,44 @@ def draw_scene(
     axes.plot(
         *evader[period], "o", color=EVADER, markersize=5.5, markeredgecolor=INK, markeredgewidth=0.9, zorder=7
     )
-    if trajectory.outcome in ("captured", "collided"):
-        colour = OUTCOME_COLOURS[trajectory.outcome]
-        axes.plot(
-            *evader[-1],
-            "X",
-            color=colour,
-            markersize=9,
-            markeredgecolor="white",
-            markeredgewidth=0.8,
-            zorder=9,
-        )
+    axes.plot(*evader[-1], **_end_look(trajectory.outcome), zorder=9)
 
 
-def scene_legend(axes: Axes, trajectory: Trajectory) -> None:
-    """The key, in axes of its own, where it cannot cover anything."""
+def _end_look(outcome: str) -> dict[str, Any]:
+    """How the end of the evader's path is marked."""
+    if outcome in ("captured", "collided"):
+        look = {"marker": OUTCOME_MARKERS[outcome], "markersize": 9, "markeredgewidth": 0.8}
+        return look | {"color": OUTCOME_COLOURS[outcome], "markeredgecolor": "white", "linestyle": "none"}
+    colour = OUTCOME_COLOURS.get(outcome, INK)
+    look = {"marker": "s" if outcome == "timed_out" else "D", "markersize": 5.5, "markeredgewidth": 1.6}
+    return look | {"color": "white", "markeredgecolor": colour, "linestyle": "none"}
+
+
+def scene_legend(axes: Axes, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
+    """The key of these scenes, in axes of its own, where it cannot cover anything."""
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
         Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
-        Line2D([], [], color=PURSUER, linewidth=0.8, linestyle=(0, (3, 2)), label="capture set K"),
+        Line2D([], [], **CAPTURE_SET_LOOK, label=capture_set_words(scenario)),
         Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
     ]
-    if trajectory.worlds.obstacles.shape[1]:
+    if trajectories[0].worlds.obstacles.shape[1]:
         handles.append(Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
     handles += [
         Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
-        Line2D([], [], color="#9A9A9A", linewidth=0.6, label="h = 0.1, 0.2, 0.3 m"),
+        Line2D(
+            [], [], color=LEVEL_COLOUR, linewidth=0.6, label=f"h = {', '.join(f'{h:g}' for h in LEVELS)} m"
+        ),
         Line2D([], [], color=TARGET, marker="*", linestyle="none", markersize=8, label="target"),
-    ]
+        Line2D(
+            [], [], color=EVADER, marker="o", linestyle="none", markeredgecolor=INK, markersize=5,
+            markeredgewidth=0.9, label="evader when sets are drawn",
+        ),
+    ]  # fmt: skip
+    for outcome in dict.fromkeys(trajectory.outcome for trajectory in trajectories):
+        handles.append(Line2D([], [], **_end_look(outcome), label=OUTCOME_WORDS[outcome]))
     axes.set_axis_off()
-    axes.legend(handles=handles, loc="center", ncols=4, columnspacing=1.4, handletextpad=0.5, fontsize=7)
+    axes.legend(handles=handles, loc="center", ncols=5, columnspacing=1.4, handletextpad=0.5, fontsize=7)
 
 
 def _times(scenario: Scenario, trajectory: Trajectory) -> np.ndarray:

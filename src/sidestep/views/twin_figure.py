@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +23,15 @@ from sidestep.views.style import (
     save,
 )
 from sidestep.views.trajectory_figures import (
+    common_limits,
     correction_norm,
     draw_scene,
-    scene_extent,
     scene_legend,
-    scene_margin,
+    scene_limits,
 )
 from sidestep.world import Scenario
 
-_NEAR = 3.0
-"""Distances are drawn up to this many times the capture distance."""
+_TICKS = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
 
 
 def twin_figure(
@@ -52,12 +52,10 @@ def twin_figure(
     """
     with house_style():
         both = {"simulation": simulation, twin_words: twin}
-        extents = [scene_extent(trajectory, near) for trajectory in both.values()]
-        limits = (
-            np.min([low for low, _ in extents], axis=0),
-            np.max([high for _, high in extents], axis=0),
+        limits = common_limits(
+            scene_limits(scenario, trajectory, shield=shield, near=near) for trajectory in both.values()
         )
-        spans = limits[1] - limits[0] + 2 * scene_margin(scenario)
+        spans = limits[1] - limits[0]
         height = float(np.clip((WIDTH - 0.7) * spans[1] / spans[0], 1.5, 3.6))
         figure = new_figure(WIDTH, 2 * height + 4.2)
         heights = [height + 0.35, height + 0.35, 0.45, 1.2, 1.2]
@@ -71,7 +69,7 @@ def twin_figure(
             )
         upper.set_xlabel("")
         upper.tick_params(labelbottom=False)
-        scene_legend(key, simulation)
+        scene_legend(key, scenario, list(both.values()))
         period = float(scenario.control_period)
         for axes, name, least in (
             (pursuers, "pursuers", float(scenario.capture_distance)),
@@ -80,20 +78,36 @@ def twin_figure(
             for trajectory, colour, words in ((simulation, GREY, "simulation"), (twin, BLUE, twin_words)):
                 _draw_distance(axes, _distances(trajectory, name), period, colour, words)
             axes.axhline(least, color=INK, linewidth=1.0)
-            axes.set_ylim(0.95 * least, _NEAR * least)
-            axes.set_ylabel("m")
+            _scale(axes, least, name, both.values())
             light_grid(axes, "y")
         pursuers.sharex(obstacles)
         pursuers.tick_params(axis="x", labelbottom=False)
-        pursuers.legend(loc="upper right", ncols=2)
+        # Beside the title, where no curve runs.
+        pursuers.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2)
         obstacles.set_xlabel("time, s")
         obstacles.set_xlim(0.0, period * max(simulation.length, twin.length))
         titles += [
-            "Distance to the pursuer; black: captured",
-            "Distance to the obstacle; black: collided",
+            "Distance to the nearest pursuer; black: captured",
+            "Distance to the nearest obstacle; black: collided",
         ]
         panel_titles([upper, lower, pursuers, obstacles], titles)
         return save(figure, path)
+
+
+def _scale(axes: Axes, least: float, name: str, trajectories: Iterable[Trajectory]) -> None:
+    """A logarithmic axis that holds both curves whole, with the contact distance at its foot."""
+    found = np.concatenate([_distances(trajectory, name) for trajectory in trajectories])
+    found = found[np.isfinite(found) & (found > 0.0)]
+    low, high = float(np.min(found, initial=least)), float(np.max(found, initial=3.0 * least))
+    axes.set_yscale("log")
+    axes.set_ylim(0.85 * low, 1.15 * high)
+    ticks, room = [], (1.3 * high / low) ** 0.12
+    for tick in _TICKS:
+        if low <= tick <= high and (not ticks or tick >= room * ticks[-1]):
+            ticks.append(tick)
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.set_ylabel("m (log scale)")
 
 
 def _distances(trajectory: Trajectory, group: str) -> Float[np.ndarray, "t"]:

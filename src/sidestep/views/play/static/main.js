@@ -142,9 +142,13 @@ function freeRoom() {
   const bar = byId("transport").getBoundingClientRect();
   const narrow = whole.width < 760;
   const verdict = byId("verdict").getBoundingClientRect();
-  const low = (strip.height ? Math.min(strip.top, bar.top) : bar.top) - whole.top - (narrow ? 26 : 6);
-  const top = narrow ? verdict.bottom - whole.top + 8 : below + 10;
-  state.ruler = narrow ? [16, verdict.bottom - whole.top + 24] : [24, strip.top - whole.top - 10];
+  const words = byId("hint").getBoundingClientRect();
+  const foot = Math.min(...[strip, bar, words].filter((box) => box.height).map((box) => box.top));
+  const low = foot - whole.top - 6;
+  const warming = byId("warming").getBoundingClientRect();
+  const head = Math.max(narrow ? verdict.bottom - whole.top : below + 2, warming.height ? warming.bottom - whole.top : 0);
+  const top = head + 8;
+  state.ruler = narrow ? [16, head + 24] : [24, strip.top - whole.top - 10];
   return { left: 14, top, width: whole.width - 28, height: Math.max(low - top, 80) };
 }
 

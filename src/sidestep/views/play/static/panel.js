@@ -6,12 +6,19 @@ const byId = (id) => document.getElementById(id);
 const SHIELDS = {
   none: "No shield: the robot just drives at its target. Anybody catches it.",
   paper: "The paper's shield believes that the pursuer drives straight on. Come at it from the front and you have it.",
-  game: "Built on the solved pursuit game: made to hold against every motion of the pursuer. Obstacles it may still hit.",
-  joint: "The game's shield that also looks ahead for a way past the obstacles. With the numbers it starts with nobody should catch it: try.",
+  game: "Built on the solved pursuit game, for every motion that the pursuer can make. Obstacles it may still hit.",
+  joint: "The game's shield that also looks ahead for a way past the obstacles.",
+};
+// Said of the shields that are built on the game, by what the numbers allow.
+const CHANCES = {
+  caught: "With these numbers the best pursuer wins: no shield can prevent that.",
+  held: "With these numbers nobody should catch it: try.",
+  open: "With these numbers the robot wins the game, but no guarantee holds at this rate: try.",
+  unsure: "With these numbers the robot wins the game: try.",
 };
 const LEGEND = [
   ["evader", "robot"], ["pursuer", "pursuer, capture circle"], ["hull", "capture set K"], ["level", "level h"],
-  ["wish", "wished velocity"], ["correction", "shield corrects"], ["plan", "way out"], ["target", "target"], ["obstacle", "obstacle"],
+  ["wish", "nominal velocity"], ["correction", "shield corrects"], ["plan", "way out"], ["target", "target"], ["obstacle", "obstacle"],
 ];
 const SHOWS = ["capture", "velocities", "rows", "plan", "trails"];
 
@@ -124,7 +131,8 @@ export class Panel {
   take(setup) {
     this.setup = setup;
     byId(`shield-${setup.shield}`).checked = true;
-    byId("shield-words").textContent = SHIELDS[setup.shield] ?? "";
+    const chances = setup.shield === "game" || setup.shield === "joint" ? ` ${CHANCES[setup.verdict.kind]}` : "";
+    byId("shield-words").textContent = (SHIELDS[setup.shield] ?? "") + chances;
     byId("pursuer").value = setup.pursuer;
     for (const [name, value] of Object.entries(setup.numbers)) {
       const range = byId(`slider-${name}`);

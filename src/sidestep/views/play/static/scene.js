@@ -6,6 +6,12 @@ const ROW_SECONDS = 2; // the same for the half-planes
 const EVADER = 0.065; // m, radius of the drawn robot; its size does not enter the problem
 const TRAIL = 14; // s
 
+// Radius (m) of the capture set K and the speed ratio that its tips follow from. With custom robots it is that of
+// the problem which covers theirs, as in all figures.
+function captureSet({ capture_set, capture_distance, evader_speed, pursuer_speed }) {
+  return capture_set ?? [capture_distance, Math.min(evader_speed / pursuer_speed, 1)];
+}
+
 export class Camera {
   constructor() {
     this.x = 0;
@@ -99,14 +105,15 @@ export class Scene {
     const { places, frame, numbers, colours, show } = view;
     const seconds = Math.min((now - (this.before ?? now)) / 1000, 0.1);
     this.before = now;
-    const tip = numbers.capture_distance / Math.min(numbers.evader_speed / numbers.pursuer_speed, 1);
+    const [radius, ratio] = captureSet(numbers);
+    const tip = radius / ratio;
     const bodies = [[...places.evader, 0.45], [...places.target, 0.2]];
     for (const pose of places.pursuers) bodies.push([pose[0], pose[1], Math.max(0.3, 0.8 * tip)]);
     for (const one of places.obstacles) bodies.push([one[0], one[1], numbers.collision_distance + 0.05]);
     camera.follow(bodies, view.free, seconds);
     const scale = camera.scale;
     pen.clearRect(0, 0, width, height);
-    this.floor(width, height, view.arena, colours);
+    this.floor(width, height, view.arena, view.free, colours);
     if (show.trails) this.drawTrails(places, frame, colours);
     for (const one of places.obstacles) this.obstacle(one, numbers.collision_distance, colours);
     this.target(places.target, view.reach, colours, now);
@@ -133,7 +140,7 @@ export class Scene {
     this.ruler(view, colours);
   }
 
-  floor(width, height, arena, colours) {
+  floor(width, height, arena, free, colours) {
     const { pen, camera } = this;
     const [x0, y1] = camera.world(0, 0);
     const [x1, y0] = camera.world(width, height);
@@ -143,6 +150,11 @@ export class Scene {
     for (let k = Math.ceil(y0 / step); k * step <= y1; k++) this.line(x0, k * step, x1, k * step, k * step, colours);
     const [left, top] = camera.px(-arena / 2, arena / 2);
     const side = arena * camera.scale;
+    // Only where nothing is written.
+    pen.save();
+    pen.beginPath();
+    pen.rect(free.left, free.top, free.width, free.height);
+    pen.clip();
     pen.strokeStyle = colours.arena;
     pen.lineWidth = 1.5;
     pen.setLineDash([2, 7]);
@@ -150,8 +162,7 @@ export class Scene {
     pen.beginPath();
     pen.roundRect(left, top, side, side, 14);
     pen.stroke();
-    pen.setLineDash([]);
-    pen.lineCap = "butt";
+    pen.restore();
   }
 
   line(xa, ya, xb, yb, at, colours) {
@@ -184,9 +195,8 @@ export class Scene {
 
   // The capture set K: the convex hull of the disc of radius l and the two tips at l / rho; and the level of
   // h through the robot, which is the same set for l + h.
-  hull([x, y], heading, radius, numbers) {
+  hull([x, y], heading, radius, rho) {
     const { pen, camera } = this;
-    const rho = Math.min(numbers.evader_speed / numbers.pursuer_speed, 1);
     const usable = Math.acos(rho);
     const r = radius * camera.scale;
     pen.save();
@@ -203,16 +213,15 @@ export class Scene {
 
   sets(at, heading, numbers, evader, colours) {
     const { pen, camera } = this;
-    const l = numbers.capture_distance;
+    const [l, rho] = captureSet(numbers);
     const [ex, ey] = camera.px(...evader);
-    const rho = Math.min(numbers.evader_speed / numbers.pursuer_speed, 1);
     const usable = Math.acos(rho);
     const distance = Math.hypot(ex - at[0], ey - at[1]) / camera.scale;
     let bearing = Math.abs(Math.atan2(-(ey - at[1]), ex - at[0]) - heading) % Math.PI;
     bearing = Math.min(bearing, Math.PI - bearing);
     const level = distance * Math.cos(Math.max(usable - bearing, 0));
     if (level > l + 0.004 && level < l + 0.9) {
-      this.hull(at, heading, level, numbers);
+      this.hull(at, heading, level, rho);
       pen.globalAlpha = Math.max(0.15, 1 - (level - l) / 0.9);
       pen.strokeStyle = colours.level;
       pen.lineWidth = 1.2;
@@ -223,7 +232,7 @@ export class Scene {
       pen.setLineDash([]);
       pen.globalAlpha = 1;
     }
-    this.hull(at, heading, l, numbers);
+    this.hull(at, heading, l, rho);
     pen.fillStyle = colours.pursuerFaint;
     pen.fill();
     pen.strokeStyle = colours.pursuer;
@@ -231,7 +240,7 @@ export class Scene {
     pen.setLineDash([6, 4]);
     pen.stroke();
     pen.setLineDash([]);
-    this.disc(at, l * camera.scale, colours.pursuerFaint, colours.pursuer);
+    this.disc(at, numbers.capture_distance * camera.scale, colours.pursuerFaint, colours.pursuer);
   }
 
   pursuer([x, y], heading, b, rolled, colours, yours) {

@@ -1,0 +1,72 @@
+"""Which labels have room? Each goes to the first free place around its point, or is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation, Text
+from matplotlib.transforms import Bbox
+
+_DOT = 2.5
+"""Points: half the width of what is kept free around every labelled point."""
+
+
+@final
+class Label(Annotation):
+    """A text beside a point of the data. `place_labels` chooses its place.
+
+    **Arguments:** `point` in data units; `places` offsets from it in points, the best one first; `rank` which
+    labels go first where room is short, the lowest rank first.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        point: tuple[float, float],
+        places: Sequence[tuple[float, float]],
+        *,
+        rank: int = 0,
+        **look: Any,
+    ):
+        super().__init__(
+            text, point, xytext=places[0], textcoords="offset points", ha="center", va="center",
+            clip_on=False, **look,
+        )  # fmt: skip
+        self.places, self.rank = tuple(places), rank
+
+
+def place_labels(figure: Figure) -> None:
+    """Move every `Label` to the first of its places where it is inside its axes and covers no other text and
+    no labelled point; hide those for which there is none."""
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        labels = [child for child in axes.get_children() if isinstance(child, Label)]
+        if labels:
+            _place(axes, sorted(labels, key=lambda label: label.rank))
+
+
+def _place(axes: Axes, labels: list[Label]) -> None:
+    figure: Any = axes.figure
+    renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
+    taken = [
+        child.get_window_extent(renderer)
+        for child in axes.get_children()
+        if isinstance(child, Text) and not isinstance(child, Label) and child.get_text()
+    ]
+    half = _DOT * figure.dpi / 72.0
+    dots = [axes.transData.transform(label.xy) for label in labels]
+    taken += [Bbox.from_extents(x - half, y - half, x + half, y + half) for x, y in dots]
+    for label in labels:
+        label.set_visible(True)
+        for place in label.places:
+            label.set_position(place)
+            box = label.get_window_extent(renderer)
+            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
+            if inside and not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+        else:
+            label.set_visible(False)
