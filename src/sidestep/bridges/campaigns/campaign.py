@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sidestep._packages import needed
 from sidestep.bridges.campaigns.cluster import LOCAL, check_options, connected, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
-from sidestep.bridges.packages import needed
 
 if TYPE_CHECKING:
     from sidestep.trials.campaign import Campaign, Job, Task

@@ -11,8 +11,8 @@ import numpy as np
 
 import sidestep
 from sidestep._arrays import AnyArray
+from sidestep._packages import needed
 from sidestep.bridges.logs import messages
-from sidestep.bridges.packages import needed
 from sidestep.learning.records import json_safe
 from sidestep.safety import Status
 from sidestep.world import Scenario
