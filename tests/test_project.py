@@ -30,31 +30,65 @@ def parts(requirement):
     return name.lower().replace("_", "-"), bounds
 
 
-def pins():
-    return dict(re.findall(r"^([\w.-]+)==([\w.]+)", text("requirements.lock"), re.MULTILINE))
+CORE, EVERYTHING = "requirements.lock", "requirements-dev.lock"
+BUILD = [*PROJECT["build-system"]["requires"], *PROJECT["dependency-groups"]["build"]]
 
 
-def test_lock_holds_no_address_and_a_hash_for_every_pin():
-    lock = text("requirements.lock")
+def pins(lock):
+    return dict(re.findall(r"^([\w.-]+)==([\w.]+)", text(lock), re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", [CORE, EVERYTHING])
+def test_lock_holds_no_address_and_a_hash_for_every_pin(name):
+    lock = text(name)
     assert "://" not in lock
     assert not re.search(r"--(extra-)?index-url|--find-links", lock)
     entries = re.split(r"\n(?=[\w.-]+==)", lock.strip())
-    assert len(entries) == len(pins())
+    assert len(entries) == len(pins(name))
     assert all("--hash=sha256:" in entry for entry in entries)
-    assert not {"torch", "stable-baselines3"} & set(pins())
+    assert not {"torch", "stable-baselines3"} & set(pins(name))
 
 
-def test_lock_pins_every_declared_dependency_within_its_bounds():
-    declared = [
-        *PROJECT["project"]["dependencies"],
-        *EXTRAS["dev"],
-        *EXTRAS["docs"],
-        *PROJECT["build-system"]["requires"],
-    ]
+@pytest.mark.parametrize(
+    "lock, declared",
+    [
+        (CORE, [*PROJECT["project"]["dependencies"], *EXTRAS["play"], *BUILD]),
+        (
+            EVERYTHING,
+            [*PROJECT["project"]["dependencies"], *EXTRAS["dev"], *EXTRAS["docs"], *BUILD],
+        ),
+    ],
+)
+def test_lock_pins_every_declared_dependency_within_its_bounds(lock, declared):
     for requirement in declared:
         name, bounds = parts(requirement)
-        assert name in pins(), f"run make lock: {name} is not pinned"
-        assert pins()[name] in SpecifierSet(bounds), f"run make lock: {name}"
+        assert name in pins(lock), f"run make lock: {name} is not pinned"
+        assert pins(lock)[name] in SpecifierSet(bounds), f"run make lock: {name}"
+
+
+def test_make_reproduce_and_make_test_agree_on_every_version_and_the_first_installs_no_test_package():
+    core, everything = pins(CORE), pins(EVERYTHING)
+    assert core.items() <= everything.items()
+    assert not {"mujoco", "onnxruntime", "playwright", "pyarrow", "av", "pyright", "pytest"} & set(core)
+
+
+def test_every_extra_is_in_the_environment_of_make_setup():
+    for extra, requirements in EXTRAS.items():
+        if extra != "bench":
+            assert {parts(requirement)[0] for requirement in requirements} <= set(pins(EVERYTHING)), extra
+
+
+def test_nothing_says_to_install_from_an_index_that_has_no_sidestep():
+    """`pip install sidestep`, with or without an extra, finds nothing or somebody else's package."""
+    words = re.compile(r"pip install (?:[^\n`]* )?['\"]?sidestep(?![\w./-])")
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split("\0")
+    told = [name for name in listed if name and name != "CHANGELOG.md" and name != "tests/test_project.py"]
+    for name in told:
+        path = ROOT / name
+        if path.suffix in {".md", ".py", ".xml", ".yaml", ".toml", ".html", ""} and path.is_file():
+            assert not words.search(path.read_text(encoding="utf-8")), name
 
 
 def test_every_dependency_has_a_lower_and_an_upper_bound():
