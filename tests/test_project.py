@@ -173,6 +173,47 @@ def test_the_gallery_shows_every_example():
             assert f'--8<-- "examples/{path.name}"' in gallery, path.name
 
 
+def masked(words):
+    """Numbers differ from machine to machine, the words around them do not."""
+    return re.sub(r"[-+]?\d+(?:\.\d+)?", "#", " ".join(words.split()))
+
+
+def printed_in_the_gallery(example):
+    """The block of output that the gallery shows below a script; None if it shows none."""
+    after = text("docs/gallery.md").partition(f'--8<-- "examples/{example}"')[2].partition("\n## ")[0]
+    block = re.search(r"^```text\n(.*?)^```$", after, re.MULTILINE | re.DOTALL)
+    return block and block[1]
+
+
+def test_every_code_block_of_the_pages_is_of_a_kind_that_runs_or_is_only_shown():
+    """An indented block, or one without a language, would not be run and nobody would notice."""
+    for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "ros2").rglob("*.md")]:
+        inside, before = None, ""
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+            where = f"{page.relative_to(ROOT)}:{number}"
+            fence = re.match(r"( *)(```+|~~~+)(.*)", line)
+            if inside is not None:
+                if fence and fence[2] == inside and not fence[3]:
+                    inside = None
+            elif fence:
+                assert fence[3] in {"python", "sh", "text", "toml", "yaml"}, where
+                inside = fence[2]
+            else:
+                assert before or not line.startswith("    "), f"{where}: fence it"
+            before = line.strip()
+
+
+def test_blocks_that_are_left_out_are_on_the_pages(request):
+    """A line of the list that no block begins with any more would hide the next block that does."""
+    root = next(
+        plugin
+        for plugin in request.config.pluginmanager.get_plugins()
+        if getattr(plugin, "__file__", None) == str(ROOT / "conftest.py")
+    )
+    for page, beginning in root.LEFT_OUT:
+        assert re.search(rf"^```(sh|python)\n{re.escape(beginning)}", text(page), re.MULTILINE), beginning
+
+
 @pytest.mark.parametrize("example", sorted(path.name for path in (ROOT / "examples").glob("*.py")))
 def test_examples_run(example):
     module, package = NEEDS.get(example, ("sidestep", ""))
@@ -186,3 +227,7 @@ def test_examples_run(example):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout
+    shown = printed_in_the_gallery(example)
+    if shown is not None:
+        warnings = re.findall(r"\w+Warning: .*", done.stderr)
+        assert masked(shown) == masked("\n".join([done.stdout, *warnings]))

@@ -1,7 +1,7 @@
 """Which packages of an extra are missing, and which command installs them from where the user is?
 
-`sidestep` is on no public index, so `pip install 'sidestep[gym]'` finds nothing: the advice names what this
-`sidestep` was installed from, and the Python that runs it.
+`sidestep` is on no public index, so its bare name with an extra finds nothing there: the advice names what
+this `sidestep` was installed from, and the Python that runs it.
 """
 
 from __future__ import annotations
