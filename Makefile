@@ -25,7 +25,7 @@ help: ## This list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  ARGS='...' adds options, for example: make reproduce ARGS='--seed 1'"
 
-setup: $(READY_DEV) ## Create .venv with sidestep, every extra, tests and documentation (2.1 GB)
+setup: $(READY_DEV) ## Create .venv with sidestep, every extra, tests and documentation (2.0 GB)
 
 $(READY): requirements.lock pyproject.toml
 	@$(PY) -c '' 2>/dev/null || { \
@@ -44,14 +44,14 @@ $(READY): requirements.lock pyproject.toml
 	  echo "Creating $(VENV) with $$($$found --version)"; \
 	  $$found -m venv --clear $(VENV) || exit 1; \
 	}
-	@echo "Installing what requirements.lock pins (CORE_DOWNLOAD to download, 0.8 GB on disk)"
+	@echo "Installing what requirements.lock pins (170 MB to download, 0.8 GB on disk)"
 	@$(INSTALL) --require-hashes -r requirements.lock
 	@$(INSTALL) --no-deps --no-build-isolation -e .
 	@touch $@
 
 $(READY_DEV): requirements-dev.lock | $(READY)
-	@echo "Installing what requirements-dev.lock pins, for tests, documentation and every extra (DEV_DOWNLOAD more to"
-	@echo "download, 2.1 GB on disk in all)"
+	@echo "Installing what requirements-dev.lock pins for tests, documentation and every extra (370 MB more to download,"
+	@echo "2.0 GB on disk in all)"
 	@$(INSTALL) --require-hashes -r requirements-dev.lock
 	@touch $@
 
