@@ -68,6 +68,10 @@ BRIEFLY = {
 }
 """What is added to the words of a command, so that it is soon done; the last of two values counts."""
 
+SMALL = ["--video-width", "320", "--video-rate", "2", "--video-speed", "5"]
+SMALL_TWIN = ["--width", "320", "--rate", "5"]
+"""Added where there is a `--video`."""
+
 MAKES_ITS_OWN_RUNS = ("README.md", "docs/start.md", "docs/guides.md")
 
 
@@ -112,7 +116,8 @@ def environment(folder: Path, address: str) -> dict[str, str]:
     """The variables of a shell in which the page's environment is active."""
     ours = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST")}
     return ours | {
-        "PATH": f"{folder / '.venv/bin'}{os.pathsep}{ours['PATH']}",
+        # Once more in front: a page's pip writes the one in .venv/bin anew.
+        "PATH": os.pathsep.join([str(folder / ".pages"), str(folder / ".venv/bin"), ours["PATH"]]),
         "VIRTUAL_ENV": str(folder / ".venv"),
         "SIDESTEP_OF_THE_PAGES": address,
         # `make test` would begin this very run again: one file of it will do.
@@ -137,6 +142,8 @@ def sidestep(words: list[str], folder: str | Path) -> int:
     from sidestep.cli import main
 
     added = BRIEFLY.get(words[0], "").split()
+    if "--video" in words:
+        added += SMALL_TWIN if words[0] in ("twin", "fly") else SMALL
     if words[0] in ("train", "evaluate", "twin", "fly", "play") and "--shield" not in words:
         added += ["--shield", "none"]
     if words[0] == "falsify" and "--replay" in words:
@@ -228,8 +235,7 @@ def make_clone(folder: Path) -> None:
     venv.create(home, symlinks=True, with_pip=False)
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(home), "platbase": str(home)}))
     (packages / "pages.pth").write_text(f"{ROOT / 'src'}\n{sysconfig.get_path('purelib')}\n")
-    command = home / "bin/sidestep"
-    command.write_text(
+    text = (
         f"#!{sys.executable} -SE\n"
         "import json, os, socket, sys\n"
         "with socket.socket(socket.AF_UNIX) as line:\n"
@@ -241,7 +247,10 @@ def make_clone(folder: Path) -> None:
         "print(text)\n"
         "sys.exit(status)\n"
     )
-    command.chmod(0o755)
+    (folder / ".pages").mkdir()
+    for command in (home / "bin/sidestep", folder / ".pages/sidestep"):
+        command.write_text(text)
+        command.chmod(0o755)
     for stamp in (".ready", ".ready-dev"):
         (home / stamp).touch()
 
@@ -256,16 +265,19 @@ def runs() -> Path:
         for words in (
             "train --out runs/mine",
             "reproduce --out runs/reproduce",
-            "falsify --shield none --out runs/falsify-game --attacks edge --seconds 20",
         ):
             text = io.StringIO()
             with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
                 assert sidestep(words.split(), folder) == 0, text.getvalue()
+        with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text), contextlib.chdir(folder):
+            from sidestep.cli import main
+
+            search = "falsify --shield none --attacks edge --episodes 16 --batch 16 --seconds 20 --out found"
+            assert main(search.split()) == 0, text.getvalue()
         for name in ("first", "none", "game-seed-0", "game-seed-1"):
             shutil.copytree(folder / "runs/mine", folder / "runs" / name)
-        found = sorted((folder / "runs/falsify-game/counterexamples").glob("*.npz"))[0]
+        found = sorted((folder / "found/counterexamples").glob("*.npz"))[0]
         found.rename(folder / "found.npz")
-        shutil.rmtree(folder / "runs/falsify-game")
         worst = sorted((folder / "runs/reproduce/joint/worst").glob("*.npz"))[0]
         shutil.copy(worst, folder / "episode.npz")
         _runs.append(folder)
