@@ -103,6 +103,7 @@ def test_every_dependency_has_a_lower_and_an_upper_bound():
 
 def test_versions_agree():
     assert f"version: {sidestep.__version__}\n" in text("CITATION.cff")
+    assert f"dist/sidestep-{sidestep.__version__}-py3-none-any.whl" in text("docs/start.md")
 
 
 @pytest.mark.parametrize("module", ["sidestep", "sidestep.cli", "sidestep.trials"])
