@@ -1,6 +1,6 @@
 """PPO of Stable-Baselines3 learns in 256 worlds at once behind `game`, and is then run behind `joint`.
 
-pip install torch==2.13.0 && pip install stable-baselines3 'sidestep[gym]'
+python -m pip install torch==2.13.0 && python -m pip install stable-baselines3 -e '.[gym]'  # in the clone
 python examples/train_many_worlds.py
 """
 

@@ -1,6 +1,6 @@
 """Stable-Baselines3 learns to reach the target behind our shield: TD3 or SAC, then episodes without noise.
 
-    pip install torch==2.13.0 && pip install stable-baselines3 'sidestep[gym]'
+    python -m pip install torch==2.13.0 && python -m pip install stable-baselines3 -e '.[gym]'  # in the clone
     python examples/train_with_sb3.py --algorithm sac
 
 A quarter of an hour on two cores, most of it in PyTorch.

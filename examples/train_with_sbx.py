@@ -1,6 +1,6 @@
 """SBX, the JAX port of Stable-Baselines3, learns behind our shield: SAC in a few minutes, then episodes.
 
-pip install torch==2.13.0 && pip install sbx-rl 'sidestep[gym]'
+python -m pip install torch==2.13.0 && python -m pip install sbx-rl -e '.[gym]'  # in the clone
 python examples/train_with_sbx.py
 """
 

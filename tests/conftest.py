@@ -1,16 +1,12 @@
 """Settings and fixtures of the whole test run.
 
-Nothing here imports `sidestep` at module level: the jaxtyping plugin has to wrap it first.
+The environment variables are set in the conftest.py of the root. Nothing here imports `sidestep` at module
+level: the jaxtyping plugin has to wrap it first.
 """
 
 import os
 import shutil
 from collections.abc import Callable, Iterator
-
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("MPLBACKEND", "Agg")
-# Most of the run is compilation, and tests compute little: two fifths less time than at the usual level.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax
 import pytest

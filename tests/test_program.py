@@ -48,3 +48,15 @@ def test_without_a_script_the_module_is_named(tmp_path, monkeypatch):
 
 def test_this_environments_own_script_exists():
     assert Path(shlex.split(_program.command())[0]).name in ("sidestep", Path(sys.executable).name)
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_the_python_named_is_this_environments(tmp_path, monkeypatch, active):
+    """The interpreters of two environments are links to one file: the file does not tell them apart."""
+    for name in ("ours", "other"):
+        (tmp_path / name / "bin").mkdir(parents=True)
+        (tmp_path / name / "bin/python").symlink_to(sys.executable)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "ours/bin/python"))
+    monkeypatch.setenv("PATH", str(tmp_path / ("ours" if active else "other") / "bin"))
+    monkeypatch.chdir(tmp_path)
+    assert _program.python() == ("python" if active else "ours/bin/python")

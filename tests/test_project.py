@@ -30,31 +30,65 @@ def parts(requirement):
     return name.lower().replace("_", "-"), bounds
 
 
-def pins():
-    return dict(re.findall(r"^([\w.-]+)==([\w.]+)", text("requirements.lock"), re.MULTILINE))
+CORE, EVERYTHING = "requirements.lock", "requirements-dev.lock"
+BUILD = [*PROJECT["build-system"]["requires"], *PROJECT["dependency-groups"]["build"]]
 
 
-def test_lock_holds_no_address_and_a_hash_for_every_pin():
-    lock = text("requirements.lock")
+def pins(lock):
+    return dict(re.findall(r"^([\w.-]+)==([\w.]+)", text(lock), re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", [CORE, EVERYTHING])
+def test_lock_holds_no_address_and_a_hash_for_every_pin(name):
+    lock = text(name)
     assert "://" not in lock
     assert not re.search(r"--(extra-)?index-url|--find-links", lock)
     entries = re.split(r"\n(?=[\w.-]+==)", lock.strip())
-    assert len(entries) == len(pins())
+    assert len(entries) == len(pins(name))
     assert all("--hash=sha256:" in entry for entry in entries)
-    assert not {"torch", "stable-baselines3"} & set(pins())
+    assert not {"torch", "stable-baselines3"} & set(pins(name))
 
 
-def test_lock_pins_every_declared_dependency_within_its_bounds():
-    declared = [
-        *PROJECT["project"]["dependencies"],
-        *EXTRAS["dev"],
-        *EXTRAS["docs"],
-        *PROJECT["build-system"]["requires"],
-    ]
+@pytest.mark.parametrize(
+    "lock, declared",
+    [
+        (CORE, [*PROJECT["project"]["dependencies"], *EXTRAS["play"], *BUILD]),
+        (
+            EVERYTHING,
+            [*PROJECT["project"]["dependencies"], *EXTRAS["dev"], *EXTRAS["docs"], *BUILD],
+        ),
+    ],
+)
+def test_lock_pins_every_declared_dependency_within_its_bounds(lock, declared):
     for requirement in declared:
         name, bounds = parts(requirement)
-        assert name in pins(), f"run make lock: {name} is not pinned"
-        assert pins()[name] in SpecifierSet(bounds), f"run make lock: {name}"
+        assert name in pins(lock), f"run make lock: {name} is not pinned"
+        assert pins(lock)[name] in SpecifierSet(bounds), f"run make lock: {name}"
+
+
+def test_make_reproduce_and_make_test_agree_on_every_version_and_the_first_installs_no_test_package():
+    core, everything = pins(CORE), pins(EVERYTHING)
+    assert core.items() <= everything.items()
+    assert not {"mujoco", "onnxruntime", "playwright", "pyarrow", "av", "pyright", "pytest"} & set(core)
+
+
+def test_every_extra_is_in_the_environment_of_make_setup():
+    for extra, requirements in EXTRAS.items():
+        if extra != "bench":
+            assert {parts(requirement)[0] for requirement in requirements} <= set(pins(EVERYTHING)), extra
+
+
+def test_nothing_says_to_install_from_an_index_that_has_no_sidestep():
+    """`pip install sidestep`, with or without an extra, finds nothing or somebody else's package."""
+    words = re.compile(r"pip install (?:[^\n`]* )?['\"]?sidestep(?![\w./-])")
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split("\0")
+    told = [name for name in listed if name and name != "CHANGELOG.md" and name != "tests/test_project.py"]
+    for name in told:
+        path = ROOT / name
+        if path.suffix in {".md", ".py", ".xml", ".yaml", ".toml", ".html", ""} and path.is_file():
+            assert not words.search(path.read_text(encoding="utf-8")), name
 
 
 def test_every_dependency_has_a_lower_and_an_upper_bound():
@@ -69,6 +103,7 @@ def test_every_dependency_has_a_lower_and_an_upper_bound():
 
 def test_versions_agree():
     assert f"version: {sidestep.__version__}\n" in text("CITATION.cff")
+    assert f"dist/sidestep-{sidestep.__version__}-py3-none-any.whl" in text("docs/start.md")
 
 
 @pytest.mark.parametrize("module", ["sidestep", "sidestep.cli", "sidestep.trials"])
@@ -139,6 +174,47 @@ def test_the_gallery_shows_every_example():
             assert f'--8<-- "examples/{path.name}"' in gallery, path.name
 
 
+def masked(words):
+    """Numbers differ from machine to machine, the words around them do not."""
+    return re.sub(r"[-+]?\d+(?:\.\d+)?", "#", " ".join(words.split()))
+
+
+def printed_in_the_gallery(example):
+    """The block of output that the gallery shows below a script; None if it shows none."""
+    after = text("docs/gallery.md").partition(f'--8<-- "examples/{example}"')[2].partition("\n## ")[0]
+    block = re.search(r"^```text\n(.*?)^```$", after, re.MULTILINE | re.DOTALL)
+    return block and block[1]
+
+
+def test_every_code_block_of_the_pages_is_of_a_kind_that_runs_or_is_only_shown():
+    """An indented block, or one without a language, would not be run and nobody would notice."""
+    for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "ros2").rglob("*.md")]:
+        inside, before = None, ""
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+            where = f"{page.relative_to(ROOT)}:{number}"
+            fence = re.match(r"( *)(```+|~~~+)(.*)", line)
+            if inside is not None:
+                if fence and fence[2] == inside and not fence[3]:
+                    inside = None
+            elif fence:
+                assert fence[3] in {"python", "sh", "text", "toml", "yaml"}, where
+                inside = fence[2]
+            else:
+                assert before or not line.startswith("    "), f"{where}: fence it"
+            before = line.strip()
+
+
+def test_blocks_that_are_left_out_are_on_the_pages(request):
+    """A line of the list that no block begins with any more would hide the next block that does."""
+    root = next(
+        plugin
+        for plugin in request.config.pluginmanager.get_plugins()
+        if getattr(plugin, "__file__", None) == str(ROOT / "conftest.py")
+    )
+    for page, beginning in root.LEFT_OUT:
+        assert re.search(rf"^```(sh|python)\n{re.escape(beginning)}", text(page), re.MULTILINE), beginning
+
+
 @pytest.mark.parametrize("example", sorted(path.name for path in (ROOT / "examples").glob("*.py")))
 def test_examples_run(example):
     module, package = NEEDS.get(example, ("sidestep", ""))
@@ -152,3 +228,7 @@ def test_examples_run(example):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout
+    shown = printed_in_the_gallery(example)
+    if shown is not None:
+        warnings = re.findall(r"\w+Warning: .*", done.stderr)
+        assert masked(shown) == masked("\n".join([done.stdout, *warnings]))

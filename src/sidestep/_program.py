@@ -29,7 +29,17 @@ def program() -> list[str]:
         return ["sidestep"]
     if script.is_file():
         return [shlex.quote(_seen_from_here(script))]
-    return [shlex.quote(sys.executable), "-m", "sidestep"]
+    return [python(), "-m", "sidestep"]
+
+
+def python() -> str:
+    """The running Python, quoted for a POSIX shell: `python` where the PATH leads to it, else its path."""
+    running = Path(sys.executable)
+    found = shutil.which("python")
+    # Not the files themselves: those of all environments are links to one.
+    if found is not None and Path(found).parent.resolve() == running.parent.resolve():
+        return "python"
+    return shlex.quote(_seen_from_here(running))
 
 
 def _seen_from_here(path: Path) -> str:

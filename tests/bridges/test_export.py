@@ -362,7 +362,7 @@ def test_what_a_graph_cannot_hold_is_refused_by_name(robot, tmp_path):
 
 def test_missing_package_is_named_with_the_command_that_installs_it(robot, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ValueError, match=r"'onnx'.*pip install 'sidestep\[export\]'"):
+    with pytest.raises(ValueError, match=r"'onnx'.*pip install .*\[export\]"):
         export_onnx(tmp_path / "x.onnx", robot.scenario, robot.policy)
 
 

@@ -231,7 +231,7 @@ def test_files_that_are_no_logs_are_refused_by_name(tmp_path):
 
 def test_missing_package_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
-    with pytest.raises(ValueError, match=r"'mcap_ros2'.*pip install 'sidestep\[logs\]'"):
+    with pytest.raises(ValueError, match=r"'mcap_ros2'.*pip install .*\[logs\]"):
         LogWriter(tmp_path / "x.mcap", load_scenario("paper"))
 
 

@@ -3,10 +3,12 @@
 import copy
 import io
 import json
+import shlex
 
 import pytest
 from rich.console import Console
 
+from sidestep._program import command
 from sidestep.commands.reproduce import Reproduce, command_line, comparison_tables
 from sidestep.trials import wilson_interval
 from sidestep.trials.reproduction import PAPER
@@ -105,8 +107,13 @@ def test_markdown_has_a_table_for_each_section(summary):
     assert {row.count("|") for row in rows} == {7}
 
 
-def test_command_to_run_it_again_names_what_was_changed():
+def test_the_command_to_run_it_again_works_when_pasted_and_names_what_was_changed(tmp_path):
     plain = command_line(Reproduce(seed=3))
-    assert plain == "sidestep reproduce --seed 3"
-    changed = command_line(Reproduce(shields=("none", "joint"), set=("a=[1, 2]",), episodes=5))
-    assert changed == "sidestep reproduce --shields none joint --episodes 5 --set 'a=[1, 2]' --seed 0"
+    assert plain == f"{command('reproduce')} --out runs/reproduce-again --seed 3"
+    changed = command_line(
+        Reproduce(out=tmp_path / "it's", shields=("none", "joint"), set=("a=[1, 2]",), episodes=5)
+    )
+    words = shlex.split(changed)[len(shlex.split(command())) :]
+    assert words[:3] == ["reproduce", "--out", f"{tmp_path}/it's-again"]
+    again = " ".join(shlex.quote(word) for word in words[3:])
+    assert again == "--shields none joint --episodes 5 --set 'a=[1, 2]' --seed 0"

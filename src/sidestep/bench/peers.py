@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from sidestep._packages import TORCH, install, install_extra
+
 
 class MissingPeer(Exception):
     """A package that a case needs is not installed."""
@@ -16,5 +18,6 @@ def peer(module: str) -> Any:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise MissingPeer(
-            f"{module} needs {error.name}, which is not installed: pip install 'sidestep[bench]'"
+            f"{module} needs {error.name}, which is not installed; in an environment of its own: "
+            f"{install(TORCH)} && {install_extra('bench')}"
         ) from error

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._program import command as command_of
 from sidestep.commands.common import (
     CountBar,
     Overrides,
@@ -124,8 +125,8 @@ def comparison_tables(sections: list[Section]) -> Iterator[Any]:
 
 
 def command_line(command: Reproduce) -> str:
-    """What to type to run the study again; the folder is left to whoever types it."""
-    parts = ["sidestep reproduce"]
+    """What to paste to run the study again, beside the folder of this one: that is never written over."""
+    parts = [command_of("reproduce", "--out", f"{command.out}-again")]
     plain = Reproduce()
     for name in ("shields", "pursuer", "episodes", "evaluation_episodes", "set", "learner"):
         value = getattr(command, name)

@@ -90,7 +90,8 @@ def training_table(summary: dict[str, Any]) -> Any:
     for key in (
         "episodes", "safe_episodes", "captured", "collided", "reached", "timed_out", "converged_episode",
         "converged_stays_from", "final_return", "min_pursuer_clearance", "min_obstacle_clearance",
-        "intervention_rate", "mean_correction", "infeasible_rate", "invalid_rate", "env_steps", "wall_seconds",
+        "intervention_rate", "mean_correction", "infeasible_rate", "invalid_rate", "env_steps",
+        "wall_seconds",
     ):  # fmt: skip
         value = summary[key]
         shown = "never" if value is None and key.startswith("converged") else value

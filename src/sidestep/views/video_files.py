@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain, islice, repeat
@@ -12,13 +11,13 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import UInt8
 
+from sidestep._packages import install_extra, needed
 from sidestep.store.files import whole_file
 from sidestep.store.outputs import try_outputs
 
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
 
 SUFFIXES = (".mp4", ".gif", ".webp")
-_INSTALL = "pip install 'sidestep[video]'"
 _H264 = {"crf": "21", "preset": "veryfast", "tune": "animation"}
 """Quality 21: 18 is hardly to be told from the original, 28 looks worn. Slower presets gain nothing here."""
 _COLOURS = 127
@@ -57,19 +56,16 @@ def load_av(extra: str = "video") -> Any:
 
     **Raises** `VideoError` when it is not installed; it names the extra that installs it.
     """
-    try:
-        return importlib.import_module("av")
-    except ModuleNotFoundError as error:
-        raise VideoError(f"writing an MP4 video needs PyAV: pip install 'sidestep[{extra}]'") from error
+    return needed("av", extra, "writing an MP4 video needs", VideoError)
 
 
 def _load_pillow(suffix: str) -> Any:
-    try:
-        image, features = (importlib.import_module(f"PIL.{name}") for name in ("Image", "features"))
-    except ModuleNotFoundError as error:
-        raise VideoError(f"writing a {suffix} animation needs Pillow: {_INSTALL}") from error
+    image, features = (
+        needed(f"PIL.{name}", "video", f"writing a {suffix} animation needs", VideoError)
+        for name in ("Image", "features")
+    )
     if suffix == ".webp" and not features.check("webp"):
-        raise VideoError(f"this Pillow was built without WebP; {_INSTALL}, or write .gif")
+        raise VideoError(f"this Pillow was built without WebP: {install_extra('video')}, or write .gif")
     return image
 
 

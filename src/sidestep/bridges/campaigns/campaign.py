@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sidestep import _interrupts
+from sidestep._packages import needed
 from sidestep.bridges.campaigns.cluster import LOCAL, check_main_guard, check_options, connected, name_of
 from sidestep.bridges.campaigns.worker import run_on_worker
-from sidestep.bridges.packages import needed
 from sidestep.store.files import OutputError
 
 if TYPE_CHECKING:

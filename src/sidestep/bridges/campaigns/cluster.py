@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sidestep._compiled import cores
-from sidestep.bridges.packages import needed
+from sidestep._packages import needed
 
 LOCAL = "local"
 _CONNECT_SECONDS = 10

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sidestep.bridges.packages import needed
+from sidestep._packages import needed
 
 
 def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:

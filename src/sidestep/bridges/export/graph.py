@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sidestep.bridges.packages import needed
+from sidestep._packages import needed
 
 OPSET = 17
 """Known to onnxruntime from 1.12 on."""

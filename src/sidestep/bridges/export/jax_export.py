@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import export
 
 from sidestep._arrays import real
+from sidestep._packages import needed
 from sidestep.bridges.export.files import facts, write_new
-from sidestep.bridges.packages import needed
 from sidestep.learning.control_step import decide
 from sidestep.safety import Shield
 from sidestep.world import Scenario, World, observation_size

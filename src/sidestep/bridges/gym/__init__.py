@@ -5,7 +5,7 @@ Importing this registers `sidestep/Pursued-v0` with Gymnasium, and
 `sidestep.bridges.gym.duel`. All need the extra `gym`.
 """
 
-from sidestep.bridges.packages import needed
+from sidestep._packages import needed
 
 gymnasium = needed("gymnasium", "gym", "the Gymnasium environments need")
 

@@ -14,13 +14,13 @@ from gymnasium.utils import seeding
 from jaxtyping import Array, Float
 
 from sidestep._arrays import seed_number
+from sidestep._packages import needed
 from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
 from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
 from sidestep.bridges.gym.worlds import given_world
-from sidestep.bridges.packages import needed
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
 from sidestep.world.observation import NEAR_ROBOT

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sidestep.bridges.packages import needed
+from sidestep._packages import needed
 from sidestep.safety import GameShield, JointShield
 from sidestep.views.motion import Instant
 from sidestep.views.moving_panel import MovingPanel

@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from sidestep._packages import TORCH, install
 from sidestep.bridges.gym.vector import PursuedVectorEnv
 
 try:
@@ -16,7 +17,7 @@ try:
 except ImportError as error:
     raise ValueError(
         f"its vector environments need Stable-Baselines3, which cannot be imported ({error}); "
-        "install it with: pip install torch==2.13.0 && pip install stable-baselines3"
+        f"install it with: {install(TORCH)} && {install('stable-baselines3>=2.9,<2.10')}"
     ) from error
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sidestep._packages import needed
 from sidestep.bridges.logs.writer import METADATA
-from sidestep.bridges.packages import needed
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import numpy as np
 
 import sidestep
 from sidestep._arrays import AnyArray
+from sidestep._packages import needed
 from sidestep.bridges.logs import messages
-from sidestep.bridges.packages import needed
 from sidestep.safety import Status
 from sidestep.store.files import OutputError, is_stream, json_safe, writing
 from sidestep.world import Scenario

@@ -7,10 +7,10 @@ import os
 import sys
 from typing import Any
 
+from sidestep._packages import needed
 from sidestep.views import video_files
 
 _LIBRARIES = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
-_INSTALL = "pip install 'sidestep[twin]'"
 
 
 class TwinError(ValueError):
@@ -39,11 +39,7 @@ def load_mujoco() -> Any:
         backend = offscreen_backend()
         if backend is not None:
             os.environ["MUJOCO_GL"] = backend
-    try:
-        import mujoco
-    except ModuleNotFoundError as error:
-        raise TwinError(f"the physics twin needs MuJoCo: {_INSTALL}") from error
-    return mujoco
+    return needed("mujoco", "twin", "the physics twin needs", TwinError)
 
 
 def offscreen_backend() -> str | None:

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from sidestep._packages import needed
 from sidestep.safety.catalogue import SHIELDS
 from sidestep.trials import Trajectory, save_trajectory
 from sidestep.trials.policies import as_policy
@@ -28,7 +29,6 @@ from sidestep.views.play.visitor import Gone, Visitor
 from sidestep.world import Scenario
 
 STATIC = Path(__file__).with_name("static")
-_INSTALL = "pip install 'sidestep[play]'"
 _ENDLESS = 2**30
 """Control periods; the page's episodes end by capture or collision only."""
 _FULL = 4013
@@ -81,14 +81,13 @@ def make_app(hosting: Hosting) -> Any:
     **Raises** `PlayError` when the extra `[play]` is not installed, and `ValueError` for an unknown shield or
     pursuer.
     """
-    try:
-        from starlette.applications import Starlette
-        from starlette.responses import FileResponse, JSONResponse, Response
-        from starlette.routing import Mount, Route, WebSocketRoute
-        from starlette.staticfiles import StaticFiles
-        from starlette.websockets import WebSocketDisconnect
-    except ModuleNotFoundError as error:
-        raise PlayError(f"the live page needs Starlette and uvicorn: {_INSTALL}") from error
+    needed("starlette", "play", "the live page needs", PlayError)
+    from starlette.applications import Starlette
+    from starlette.responses import FileResponse, JSONResponse, Response
+    from starlette.routing import Mount, Route, WebSocketRoute
+    from starlette.staticfiles import StaticFiles
+    from starlette.websockets import WebSocketDisconnect
+
     _check(hosting)
     limits = hosting.limits
     scenario = replace(hosting.scenario, episode_steps=_ENDLESS)
@@ -281,11 +280,9 @@ def make_server(app: Any, limits: Limits) -> Any:
 
     **Raises** `PlayError` when the extra `[play]` is not installed.
     """
-    try:
-        import uvicorn
-        from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-    except ModuleNotFoundError as error:
-        raise PlayError(f"the live page needs uvicorn and websockets: {_INSTALL}") from error
+    uvicorn = needed("uvicorn", "play", "the live page needs", PlayError)
+    needed("websockets", "play", "the live page needs", PlayError)
+    from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
     class Protocol(WebSocketsSansIOProtocol):
         """Waits for the visitor once a few frames have not gone out."""
