@@ -34,6 +34,7 @@ class Report:
 
 def run(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
+    from sidestep.learning.records import held_if_run
     from sidestep.views import write_report
 
     if not command.runs:
@@ -48,10 +49,11 @@ def run(command: Report, console: Console) -> int:
     folders = _run_folders(command.runs, console)
     path = command.out or command.runs[0] / "report.html"
     _refuse_other_files(path)
-    for folder in folders:
-        _look_closer(folder, command.episodes, console)
     figures = None if path.stem == "report" else path.with_name(f"{path.stem}-figures")
-    written = write_report(folders, path, figures=figures)
+    with held_if_run(path.parent):
+        for folder in folders:
+            _look_closer(folder, command.episodes, console)
+        written = write_report(folders, path, figures=figures)
     console.print(f"Report with figures: {written}", highlight=False)
     return 0
 
@@ -93,19 +95,19 @@ def _refuse_other_files(path: Path) -> None:
 def _look_closer(folder: Path, episodes: int, console: Console) -> None:
     """Run random episodes with the policy of a run whose folder has no record of any, and keep them there."""
     from sidestep.learning.records import read_json
+    from sidestep.store.lock import hold
     from sidestep.trials import load_survey, save_survey, survey_run
 
     if not episodes or not (folder / "policy.npz").exists() or load_survey(folder) is not None:
         return
     config = read_json(folder / "config.json")
     try:
-        with CountBar(console, f"{config['shield']} shield, {episodes} episodes") as show:
+        with hold(folder), CountBar(console, f"{config['shield']} shield, {episodes} episodes") as show:
             survey = survey_run(folder, episodes, progress=show)
+            save_survey(folder, survey)
     except (KeyError, ValueError) as error:
         # A shield or pursuer of the user's own is known by its name alone, which brings nothing back.
         console.print(f"No episodes run for {folder}: {error}", highlight=False)
-        return
-    save_survey(folder, survey)
 
 
 def _report_episode(command: Report, console: Console) -> int:
