@@ -136,11 +136,9 @@ def _again(command: Campaign, folder: Path) -> str:
     words = ["campaign", command.file, "--out", folder]
     if command.scheduler != "local":
         words += ["--scheduler", command.scheduler]
-    options = (
-        ("workers", command.workers), ("threads-per-worker", command.threads_per_worker), ("json", command.json),
-    )  # fmt: skip
-    for option, value in options:
-        words += [] if value is None else [f"--{option}", value]
+    for option in ("workers", "threads_per_worker", "json"):
+        value = getattr(command, option)
+        words += [] if value is None else [f"--{option.replace('_', '-')}", value]
     return command_line(*words)
 
 

@@ -153,8 +153,9 @@ def _who(file: Path, holder: dict[str, Any]) -> str:
     folder = file.parent
     if not holder:
         return f"{folder} is in use by another process; wait until it ends, or choose another folder"
-    place = "this host, " if holder["host"] == socket.gethostname() else ""
-    words = f"{folder} is in use by process {holder['process']} on {place}{holder['host']} since {holder['since']}"
+    host = holder["host"]
+    place = f"this host, {host}," if host == socket.gethostname() else host
+    words = f"{folder} is in use by process {holder['process']} on {place} since {holder['since']}"
     if "silent" in holder:
         return (
             f"{words}; its last sign of life was {max(0.0, holder['silent']):.0f} s ago. If it was killed, "

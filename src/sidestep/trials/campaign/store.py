@@ -66,8 +66,7 @@ class Store:
     def alone(self) -> Iterator[None]:
         """While this lasts, no other command works on the folder; a killed one no longer does.
 
-        **Raises** `FolderInUseError` when another does, `ValueError` when the folder holds something else than
-        a campaign.
+        **Raises** `FolderInUseError` when another does, `ValueError` when the folder holds something else.
         """
         self._refuse_what_is_not_ours()
         with hold(self.folder):
@@ -85,8 +84,7 @@ class Store:
             raise ValueError(f"{self.folder} holds other files and no campaign; choose another --out")
 
     def lock(self, job: str) -> AbstractContextManager[None]:
-        """Held by the process that runs the job: a worker taken for dead does not run it beside another, which
-        waits for it."""
+        """Held by the process that runs the job: a worker taken for dead does not run it beside another."""
         return hold_files(self.folder / "locks" / f"{job}.lock", wait=True)
 
     def run_folder(self, job: str) -> Path:
@@ -110,7 +108,8 @@ class Store:
             with contextlib.suppress(FileNotFoundError):
                 os.replace(path, aside)
                 warnings.warn(
-                    f"{path} is damaged. It is now {aside.name}; lost: the result of this job, which is run again",
+                    f"{path} is damaged and now called {aside.name}. Lost: the result of this job, which is "
+                    "run again",
                     DamageWarning,
                     stacklevel=2,
                 )

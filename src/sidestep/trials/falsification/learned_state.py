@@ -21,7 +21,7 @@ def _before(folder: Path, name: str) -> Path:
 
 
 def keep(folder: Path, name: str, state: Any, rows: dict[str, int], round: int) -> None:
-    """Store what an attack has learned by the end of a round, counted from 0; that of the one before stays."""
+    """Store what an attack has learned by the end of a round (from 0); that of the one before stays."""
     newest = _newest(folder, name)
     if round and newest.is_file():
         os.replace(newest, _before(folder, name))
