@@ -77,10 +77,9 @@ class Store:
             raise ValueError(f"{self.folder} is a file, not a folder; choose another --out")
         if not self.folder.is_dir() or self.token is not None:
             return
-        # What a kill leaves before `campaign.json` is in place.
-        if not all(
-            is_vacant(entry) or entry.name.startswith(".campaign.json.") for entry in self.folder.iterdir()
-        ):
+        # What a kill leaves before `campaign.json` is in place; the first is that of earlier versions.
+        begun = ("campaign.lock", ".campaign.json.")
+        if not all(is_vacant(entry) or entry.name.startswith(begun) for entry in self.folder.iterdir()):
             raise ValueError(f"{self.folder} holds other files and no campaign; choose another --out")
 
     def lock(self, job: str) -> AbstractContextManager[None]:
