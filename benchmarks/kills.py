@@ -128,7 +128,7 @@ def writes(out: Path) -> set[Path]:
 def contents(out: Path) -> dict[str, Any]:
     """What must be the same, by file."""
     found: dict[str, Any] = {}
-    newest = {checkpoints: max(checkpoints.glob("*.npz")) for checkpoints in out.rglob("checkpoints")}
+    newest = {path: max(path.glob("*.npz"), default=None) for path in out.rglob("checkpoints")}
     for path in sorted(out.rglob("*")):
         name = path.relative_to(out)
         # What a worker of a campaign was writing when it was killed stays beside the results.
