@@ -41,6 +41,14 @@ def contents(folder):
     return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _no_figures():
+    """Figures take longer than all else here; the processes that are started draw them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sidestep.views.write_report", lambda runs, path, **_: path)
+        yield
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, compiled_programs):
     """Each command, run to its end. Not to be written to."""
