@@ -21,6 +21,7 @@ from sidestep.bridges.campaigns import run_campaign, worker
 from sidestep.bridges.campaigns.campaign import _Waiting
 from sidestep.bridges.campaigns.cluster import local_size
 from sidestep.cli import main
+from sidestep.store.lock import FolderInUseError
 from sidestep.trials.campaign import Job, Store
 
 HERE = Path(__file__).parent
@@ -252,8 +253,21 @@ def test_worker_taken_for_dead_is_waited_for_and_its_result_is_the_one(stand_ins
 def test_two_commands_do_not_work_on_one_folder(stand_ins, threads, tmp_path):
     out = tmp_path / "out"
     campaign = stand_ins.make_campaign(tmp_path / "log", 1)
-    with Store(out).alone(), pytest.raises(ValueError, match="another sidestep campaign is at work"):
+    held, finish = threading.Event(), threading.Event()
+
+    def other():
+        with Store(out).alone():
+            held.set()
+            finish.wait(60)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    assert held.wait(60)
+    with pytest.raises(FolderInUseError, match=rf"{out} is in use by process {os.getpid()}"):
         run_campaign(campaign, out, scheduler=threads, run=stand_ins.stand_in)
+    assert not (out / "campaign.json").exists()
+    finish.set()
+    thread.join()
     assert run_campaign(campaign, out, scheduler=threads, run=stand_ins.stand_in).complete
 
 

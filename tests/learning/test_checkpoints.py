@@ -28,6 +28,7 @@ from sidestep.learning.checkpoints import (
 from sidestep.learning.records import RunError, read_metrics, read_summary
 from sidestep.learning.training import start
 from sidestep.safety import as_shield
+from sidestep.store.damage import DamageWarning
 from sidestep.store.files import read_json
 from sidestep.world import scenario_to_dict
 
@@ -229,10 +230,18 @@ def test_damaged_newest_checkpoint_falls_back_on_the_one_before_it(small, whole,
         (tmp_path / "run" / name).unlink()
     older, newest = list_checkpoints(tmp_path / "run")
     damage(newest, how)
-    state, _ = read_checkpoint(tmp_path / "run", fresh_state(small))
+    with pytest.warns(DamageWarning) as warned:
+        state, _ = read_checkpoint(tmp_path / "run", fresh_state(small))
+    (said,) = (str(one.message) for one in warned)
+    begin = int(state.episodes)
+    assert str(newest) in said
+    assert f"after episode {begin}" in said
+    assert f"{8 - begin} episodes" in said
     assert newest.stem.endswith(f"{8:06d}")
     assert older.stem.endswith(f"{int(state.episodes):06d}")
-    same_run(small, small.train(out=tmp_path / "run", resume=True), whole)
+    with pytest.warns(DamageWarning, match=newest.name):
+        again = small.train(out=tmp_path / "run", resume=True)
+    same_run(small, again, whole)
     for path in list_checkpoints(tmp_path / "run"):
         damage(path, how)
     before = contents(tmp_path / "run")

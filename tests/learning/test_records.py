@@ -22,6 +22,7 @@ from sidestep.learning.records import (
     summarise,
     truncate_metrics,
     write_summary,
+    writing,
 )
 from sidestep.store.files import OutputError, json_safe, read_json, write_json
 
@@ -132,6 +133,39 @@ def test_damaged_metrics_name_the_line(tmp_path):
         file.write(b"garbage\n")
     with pytest.raises(RunError, match="line 2"):
         read_metrics(tmp_path)
+
+
+@pytest.mark.parametrize("numbers", [[1, 2, 2], [1, 3], [2, 3], [1, 2, 1, 2]])
+def test_episodes_doubled_or_out_of_order_are_not_counted(tmp_path, numbers):
+    """As two writers leave them: figures would be of 260 episodes where there were 200."""
+    append_metrics(tmp_path, [episode(number) for number in numbers])
+    wrong = next(line for line, number in enumerate(numbers, start=1) if number != line)
+    words = rf"line {wrong} of .*metrics.jsonl is episode {numbers[wrong - 1]} where episode {wrong} belongs"
+    with pytest.raises(RunError, match=words + r".*--out"):
+        read_metrics(tmp_path)
+
+
+def test_rounds_of_a_search_are_numbered_for_each_attack(tmp_path):
+    lines = [{"attack": attack, "round": number} for attack, number in [("a", 0), ("b", 0), ("a", 1)]]
+    append_metrics(tmp_path, lines)
+    assert read_metrics(tmp_path) == lines
+    append_metrics(tmp_path, [{"attack": "b", "round": 0}])
+    with pytest.raises(RunError, match=r"line 4 of .* is b round 0 where b round 1 belongs"):
+        read_metrics(tmp_path)
+
+
+def test_half_files_of_killed_processes_are_swept_and_no_others(tmp_path):
+    run = create_run(tmp_path / "run", {})
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for name in (f".summary.json.{gone.pid}.tmp", f".summary.json.{os.getpid()}.tmp", ".mine.tmp"):
+        (run / name).touch()
+    with writing(run, resume=True):
+        pass
+    assert sorted(path.name for path in run.glob(".*.tmp")) == [
+        ".mine.tmp",
+        f".summary.json.{os.getpid()}.tmp",
+    ]
 
 
 def test_resume_from_an_older_checkpoint_drops_later_episodes(tmp_path):

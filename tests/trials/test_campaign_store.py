@@ -7,6 +7,7 @@ import threading
 
 import pytest
 
+from sidestep.store.damage import DamageWarning
 from sidestep.trials.campaign import Job, Store, campaign_rows
 from sidestep.trials.campaign import store as store_module
 from sidestep.trials.campaign.jobs import record_of
@@ -61,7 +62,8 @@ def test_damaged_result_is_no_result_and_gives_way_to_a_new_one(store, damage):
     store.keep(record(JOBS[0]))
     path = store.path(JOBS[0].id)
     path.write_bytes(damage(path.read_bytes()))
-    assert store.keep(record(JOBS[0], 3.0))
+    with pytest.warns(DamageWarning, match=rf"{path} is damaged.*run again"):
+        assert store.keep(record(JOBS[0], 3.0))
     assert store.read(JOBS[0].id)["figures"]["value"] == 3.0
     assert store.damaged() == 1
 
@@ -69,7 +71,8 @@ def test_damaged_result_is_no_result_and_gives_way_to_a_new_one(store, damage):
 def test_result_under_another_jobs_name_is_not_believed(store):
     store.keep(record(JOBS[0]))
     os.rename(store.path(JOBS[0].id), store.path(JOBS[1].id))
-    assert store.read(JOBS[1].id) is None
+    with pytest.warns(DamageWarning, match=JOBS[1].id):
+        assert store.read(JOBS[1].id) is None
 
 
 def test_kill_while_writing_leaves_nothing_that_counts(store, monkeypatch):

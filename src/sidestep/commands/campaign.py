@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sidestep.commands.common import CampaignBar, going_on, stood_still, write_json_file
+from sidestep._program import command as command_line
+from sidestep.commands.common import CampaignBar, going_on, say, stood_still, write_json_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,9 +59,10 @@ def run(command: Campaign, console: Console) -> int:
         console.print(f"{plan.name}: {len(plan.jobs)} jobs, {done} of them done in {folder}", highlight=False)
         return 0
     from sidestep.bridges.campaigns import run_campaign
+    from sidestep.store.damage import damage_on_stderr
 
-    going = going_on(folder, *_again(command, folder))
-    with going, CampaignBar(console, plan.name) as show:
+    going = going_on(console, folder, *_again(command, folder))
+    with going, damage_on_stderr(), CampaignBar(console, plan.name) as show:
         outcome = run_campaign(
             plan, folder, scheduler=command.scheduler, workers=command.workers,
             threads_per_worker=command.threads_per_worker, progress=show,
@@ -108,40 +110,39 @@ def _report(plan: Plan, outcome: CampaignOutcome, comparisons: Sequence[Comparis
 
 def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Console) -> None:
     """What was done, what was not, and how to go on."""
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False, soft_wrap=True)
-
     say(
+        console,
         f"{outcome.done} of {outcome.jobs} jobs have a result: "
-        f"{outcome.ran} ran now, {outcome.earlier} before. Table: {folder / 'results.parquet'}"
+        f"{outcome.ran} ran now, {outcome.earlier} before. Table: {folder / 'results.parquet'}",
     )
     if outcome.damaged:
-        say(f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
+        say(console, f"Damaged result files that were set aside, and their jobs run again: {outcome.damaged}")
     still = sum(row.get("pursuer_invalid") or 0 for row in outcome.rows)
     if still:
-        say(f"Warning: {stood_still(still)}")
+        say(console, f"Warning: {stood_still(still)}")
     used = {row["version_sidestep"] for row in outcome.rows}
     if len(used) > 1:
-        say(f"Results come from different versions of sidestep: {', '.join(sorted(used))}")
+        say(console, f"Results come from different versions of sidestep: {', '.join(sorted(used))}")
     for failure in outcome.failed[:_FAILURES_SHOWN]:
         labels = ", ".join(f"{name} {label}" for name, label in failure.job.labels.items())
-        say(f"Failed: {labels}: {failure.reason}")
+        say(console, f"Failed: {labels}: {failure.reason}")
     if len(outcome.failed) > _FAILURES_SHOWN:
-        say(f"and {len(outcome.failed) - _FAILURES_SHOWN} more failed; --json lists all")
+        say(console, f"and {len(outcome.failed) - _FAILURES_SHOWN} more failed; --json lists all")
     if outcome.complete:
         return
     reason = "Jobs failed" if outcome.stopped is None else outcome.stopped[0].upper() + outcome.stopped[1:]
-    say(f"{reason}. What is done stays done; go on with: {command_line(*_again(command, folder))}")
+    again = command_line(*_again(command, folder))
+    say(console, f"{reason}. What is done stays done; go on with: {again}")
 
 
-def _again(command: Campaign, folder: Path) -> list[str]:
-    """What to type after `sidestep` to go on."""
-    words = ["campaign", str(command.file), "--out", str(folder)]
+def _again(command: Campaign, folder: Path) -> list[object]:
+    """What to type after `sidestep` to do the rest."""
+    words: list[object] = ["campaign", command.file, "--out", folder]
     if command.scheduler != "local":
         words += ["--scheduler", command.scheduler]
-    for option, value in (("workers", command.workers), ("threads-per-worker", command.threads_per_worker)):
-        words += [] if value is None else [f"--{option}", str(value)]
+    for option in ("workers", "threads_per_worker", "json"):
+        value = getattr(command, option)
+        words += [] if value is None else [f"--{option.replace('_', '-')}", value]
     return words
 
 

@@ -4,26 +4,86 @@ from __future__ import annotations
 
 import abc
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, cast
 
 import tyro
 
+from sidestep import _interrupts
 from sidestep._program import command as command_line
 from sidestep.store.files import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.learning import Progress
+    from sidestep.learning import Progress, TrainingOptions
     from sidestep.world import Scenario
 
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=VALUE ...]")]
 PursuerName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 ShieldName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 ScenarioName = Annotated[str, tyro.conf.arg(metavar="NAME|FILE")]
+T = TypeVar("T")
+
+
+class _NotGiven:
+    """Marks a default: the value counts like any other, but was not asked for."""
+
+
+def unless_given(value: T) -> T:
+    """`value` as the default of an option, told apart from the same value given; see `given`."""
+    kind: Any = type("Default", (_NotGiven, type(value)), {})
+    return cast(T, kind(value))
+
+
+def given(command: Any, *names: str) -> dict[str, Any]:
+    """Of the options of these names those that were given, as plain values."""
+    values = {name: getattr(command, name) for name in names}
+    return {
+        name: value
+        for name, value in values.items()
+        if not isinstance(value, _NotGiven) and value is not None and value != ()
+    }
+
+
+def settings_from(command: Any, *names: str, stored: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The options of these names: what the command says, or for a run that is resumed what its folder says
+    (`stored`) unless an option was given."""
+    if stored is None:
+        return {name: getattr(command, name) for name in names}
+    return {**stored, **given(command, *names)}
+
+
+def scenario_from(command: Any, stored: Scenario | None = None) -> Scenario:
+    """The scenario of `--scenario` (if there is such an option) and `--set`, on top of a resumed run's."""
+    from sidestep.world import load_scenario, scenario_to_dict
+
+    changes = scenario_overrides(command.set)
+    named = getattr(command, "scenario", None)
+    if stored is None or (named is not None and not isinstance(named, _NotGiven)):
+        return load_scenario(named or "paper", **changes)
+    return load_scenario("paper", **{**scenario_to_dict(stored), **changes})
+
+
+def options_from(command: Any, stored: TrainingOptions | None = None) -> TrainingOptions:
+    """The training options of `--learner`, on top of a resumed run's."""
+    from sidestep.learning import make_options, options_to_dict
+
+    return make_options(
+        **{**({} if stored is None else options_to_dict(stored)), **parse_overrides(command.learner)}
+    )
+
+
+def resume_words(name: str, folder: Path, json: Path | None) -> list[object]:
+    """What to type after `sidestep` to go on with the run in a folder."""
+    return [name, "--out", folder, "--resume", *([] if json is None else ["--json", json])]
+
+
+def say(console: Console, text: str) -> None:
+    """Print a line as it is: neither wrapped, so that commands in it can be pasted, nor coloured."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
@@ -80,20 +140,30 @@ def scenario_of_run(
 
 
 @contextmanager
-def going_on(folder: Path, *words: object) -> Iterator[None]:
-    """Adds to the error of what cannot be written into `folder` any more the command to go on with."""
-    try:
-        yield
-    except OutputError as error:
-        raise advised(error, folder, *words) from error.__cause__
+def going_on(console: Console, folder: Path, *words: object) -> Iterator[None]:
+    """Says how to do the rest (`words` after `sidestep`) when Ctrl-C, or a disk that takes no more, ends what
+    is inside."""
+
+    def farewell() -> str:
+        if not _begun(folder):
+            return f"Interrupted before anything was written in {folder}."
+        return f"Interrupted. Continue with: {command_line(*words)}"
+
+    with _interrupts.before_leaving(lambda: _interrupts.say(farewell())):
+        try:
+            yield
+        except KeyboardInterrupt:
+            say(console, farewell())
+            raise
+        except OutputError as error:
+            if not _begun(folder):
+                raise
+            first = "With more room there" if error.full else "When that is mended"
+            raise error.and_kept(f"{first}, go on with: {command_line(*words)}") from error.__cause__
 
 
-def advised(error: OutputError, folder: Path, *words: object) -> OutputError:
-    """The error with the command to go on with, if anything was begun in `folder`."""
-    if not any((folder / name).is_file() for name in ("config.json", "campaign.json")):
-        return error
-    first = "With more room there" if error.full else "When that is mended"
-    return error.and_kept(f"{first}, go on with: {command_line(*words)}")
+def _begun(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in ("config.json", "campaign.json"))
 
 
 def stood_still(periods: int, episodes: int | None = None) -> str:

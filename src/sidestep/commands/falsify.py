@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._program import command as command_line
 from sidestep.commands.common import (
     CountBar,
     Overrides,
     ShieldName,
+    given,
     going_on,
+    resume_words,
+    say,
+    scenario_from,
     scenario_overrides,
+    settings_from,
     stood_still,
+    unless_given,
     write_json_file,
 )
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
@@ -29,9 +36,9 @@ if TYPE_CHECKING:
 class Falsify:
     """Search for a pursuer, and a start, that break a shield; keep what is found, ready to play again."""
 
-    shield: ShieldName = "joint"
+    shield: ShieldName = unless_given("joint")
     """Shield to attack."""
-    policy: Annotated[str, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
+    policy: Annotated[str, tyro.conf.arg(metavar="RUN|goal-seeking")] = unless_given("goal-seeking")
     """Run folder whose policy steers the evader, or goal-seeking for the untrained one."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder to write, never overwritten silently; runs/falsify-SHIELD by default."""
@@ -39,24 +46,26 @@ class Falsify:
     """Preset (paper, paper-test) or a TOML or JSON file; the policy's own scenario, or paper, by default."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=0."""
-    goal: str = "both"
+    goal: str = unless_given("both")
     """What counts: capture, collision or both."""
     attacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
     """Attacks: pursuers, bang-bang, herder, sideswipe, cross-entropy, edge, learned; all by default."""
     minutes: float | None = None
-    """Time to search for; 3 unless --episodes is given. With --resume on top of the time so far."""
+    """Time to search for; 3 unless --episodes is given. With --resume on top of the time so far; what is left
+    of it if neither is given."""
     episodes: int | None = None
-    """Episodes after which each attack ends."""
-    seconds: float = 60.0
+    """Episodes after which each attack ends; with --resume the new total."""
+    seconds: float = unless_given(60.0)
     """Longest episode, in seconds of its own time."""
-    batch: int = 256
+    batch: int = unless_given(256)
     """Episodes or plans tried at once; fewer make rounds shorter under a shield that is slow."""
-    most: int = 5
+    most: int = unless_given(5)
     """Counterexamples to keep per attack and outcome (more if they go deeper, or break no assumption)."""
-    seed: int = 0
+    seed: int = unless_given(0)
     """Seed of everything random."""
     resume: bool = False
-    """Go on with the search in --out; its own settings are used."""
+    """Go on with the search in --out, with the settings it was begun with. Other options beside it must agree
+    with those."""
     replay: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Play this counterexample again, check that it ends the same, and draw it. Searches for nothing."""
     json: Path | None = None
@@ -80,31 +89,41 @@ def run(command: Falsify, console: Console) -> int:
     whole_number("batch", command.batch), whole_number("most", command.most)
     if command.replay is not None:
         return _replay(command, console)
-    from sidestep.learning.records import open_run
-    from sidestep.trials.falsification import ATTACKS, Plan, certified_clearance, falsify
-    from sidestep.world import load_scenario
+    from sidestep.learning.records import writing
+    from sidestep.store.damage import damage_on_stderr
 
-    overrides = scenario_overrides(command.set)
-    if command.scenario is None and (Path(command.policy) / "config.json").is_file():
-        scenario = load_scenario("paper", **{**open_run(command.policy)["scenario"], **overrides})
+    with going_on(console, out, *resume_words("falsify", out, command.json)):
+        with damage_on_stderr(), writing(out, resume=command.resume):
+            found = _search(command, out, console)
+        if found.interrupted:
+            raise KeyboardInterrupt
+    if found.had_ended:
+        longer = command_line("falsify", "--out", out, "--resume", "--minutes", 3)
+        say(console, f"{out} had been searched for as long as was asked. To search on: {longer}")
+    if found.counterexamples:
+        first = command_line("falsify", "--replay", found.counterexamples[0])
+        say(console, f"{len(found.counterexamples)} in {out}; next: {first}")
+    return 1 if found.inside else 0
+
+
+def _search(command: Falsify, out: Path, console: Console) -> Falsification:
+    """The search, its table and its figures."""
+    from sidestep.trials.falsification import ATTACKS, Plan, certified_clearance, falsify, search_settings
+
+    stored = search_settings(out) if command.resume else None
+    settings = settings_from(command, "shield", "policy", stored=stored)
+    scenario = settings["scenario"] = _scenario(command, settings.get("scenario"))
+    names = ("seed", "goal", "attacks", "batch", "seconds", "most")
+    if stored is None:
+        asked = settings_from(command, *names)
+        guaranteed = certified_clearance(scenario, settings["shield"])
+        plan = Plan(**{**asked, "attacks": command.attacks or ATTACKS}, guaranteed_clearance=guaranteed)
     else:
-        scenario = load_scenario(command.scenario or "paper", **overrides)
-    with going_on(out, "falsify", "--out", out, "--resume"), SearchBar(console) as show:
-        plan = Plan(
-            guaranteed_clearance=None if command.resume else certified_clearance(scenario, command.shield),
-            seed=command.seed,
-            goal=command.goal,
-            attacks=command.attacks or ATTACKS,
-            batch=command.batch,
-            seconds=command.seconds,
-            most=command.most,
-        )
+        plan = replace(stored["plan"], **given(command, *names))
+    with SearchBar(console) as show:
         found = falsify(
-            scenario,
-            command.policy,
-            command.shield,
+            **{**settings, "plan": plan},
             out=out,
-            plan=plan,
             minutes=command.minutes,
             episodes=command.episodes,
             resume=command.resume,
@@ -115,13 +134,19 @@ def run(command: Falsify, console: Console) -> int:
         console.print(line, highlight=False)
     write_json_file(command.json, found.summary)
     _draw_all(found, console)
-    if found.interrupted:
-        console.print(f"Interrupted. Continue with: sidestep falsify --out {out} --resume")
-        return 130
-    if found.counterexamples:
-        first = found.counterexamples[0]
-        console.print(f"{len(found.counterexamples)} in {out}; next: sidestep falsify --replay {first}")
-    return 1 if found.inside else 0
+    return found
+
+
+def _scenario(command: Falsify, stored: Any) -> Any:
+    """As `scenario_from`, but a new search without one takes that of the policy's run."""
+    from sidestep.learning.records import open_run
+    from sidestep.world import load_scenario
+
+    if stored is None and command.scenario is None and (Path(command.policy) / "config.json").is_file():
+        return load_scenario(
+            "paper", **{**open_run(command.policy)["scenario"], **scenario_overrides(command.set)}
+        )
+    return scenario_from(command, stored)
 
 
 class SearchBar:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -82,6 +83,13 @@ class Fly:
 
 def run(command: Fly, console: Console) -> int:
     """Run `sidestep fly`; returns the exit status."""
+    from sidestep.store.lock import hold
+
+    with nullcontext() if command.out is None else hold(command.out):
+        return _run(command, console)
+
+
+def _run(command: Fly, console: Console) -> int:
     from sidestep.bridges.flight import ROOM_SENSORS, FlightOptions, Pilot, certificate_of, fly, write_video
     from sidestep.bridges.twin import changed_sensors
 

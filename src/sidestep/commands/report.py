@@ -34,6 +34,7 @@ class Report:
 
 def run(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
+    from sidestep.learning.records import held_if_run
     from sidestep.store.files import OutputError
     from sidestep.store.outputs import try_outputs
     from sidestep.views import write_report
@@ -57,9 +58,10 @@ def run(command: Report, console: Console) -> int:
         try_outputs(folders=unseen)
     except OutputError as error:
         raise error.and_kept("Its episodes are to be kept there; --episodes 0 reports without any") from error
-    for folder in unseen:
-        _look_closer(folder, command.episodes, console)
-    written = write_report(folders, path, figures=figures)
+    with held_if_run(path.parent):
+        for folder in unseen:
+            _look_closer(folder, command.episodes, console)
+        written = write_report(folders, path, figures=figures)
     console.print(f"Report with figures: {written}", highlight=False)
     return 0
 
@@ -107,17 +109,17 @@ def _is_unseen(folder: Path) -> bool:
 def _look_closer(folder: Path, episodes: int, console: Console) -> None:
     """Run random episodes with the policy of a run, and keep them in its folder."""
     from sidestep.store.files import read_json
+    from sidestep.store.lock import hold
     from sidestep.trials import save_survey, survey_run
 
     config = read_json(folder / "config.json")
     try:
-        with CountBar(console, f"{config['shield']} shield, {episodes} episodes") as show:
+        with hold(folder), CountBar(console, f"{config['shield']} shield, {episodes} episodes") as show:
             survey = survey_run(folder, episodes, progress=show)
+            save_survey(folder, survey)
     except (KeyError, ValueError) as error:
         # A shield or pursuer of the user's own is known by its name alone, which brings nothing back.
         console.print(f"No episodes run for {folder}: {error}", highlight=False)
-        return
-    save_survey(folder, survey)
 
 
 def _report_episode(command: Report, console: Console) -> int:

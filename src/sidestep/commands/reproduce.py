@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shlex
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +17,12 @@ from sidestep.commands.common import (
     Overrides,
     PursuerName,
     TrainingBar,
-    advised,
-    parse_overrides,
+    going_on,
+    options_from,
+    resume_words,
+    scenario_from,
+    settings_from,
+    unless_given,
     write_json_file,
 )
 
@@ -33,62 +38,64 @@ class Reproduce:
 
     out: Path = Path("runs/reproduce")
     """Folder to write; one run folder per shield, summary.json, comparison.md, figures and report.html."""
-    shields: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = (
-        "none",
-        "paper",
-        "game",
-        "joint",
+    shields: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = unless_given(
+        ("none", "paper", "game", "joint")
     )
     """Shields to compare: none, paper, game and joint."""
-    pursuer: PursuerName = "nash"
+    pursuer: PursuerName = unless_given("nash")
     """Pursuer strategy."""
-    episodes: int = 200
+    episodes: int = unless_given(200)
     """Training episodes per shield (the paper's 200)."""
-    evaluation_episodes: int = 1000
+    evaluation_episodes: int = unless_given(1000)
     """Random episodes to measure each trained policy on."""
-    seed: int = 0
+    seed: int = unless_given(0)
     """Seed of everything random."""
     set: Overrides = ()
     """Scenario fields to change."""
     learner: Overrides = ()
     """Training options to change."""
     resume: bool = False
-    """Continue in --out: finished parts are kept, an interrupted training goes on where it stopped."""
+    """Continue in --out with the settings it was begun with: finished parts are kept, an interrupted training
+    goes on where it stopped. Other options beside it must agree with those, --episodes too."""
     json: Path | None = None
     """Also write the comparison to this file."""
 
 
 def run(command: Reproduce, console: Console) -> int:
     """Run `sidestep reproduce`; returns the exit status."""
-    from sidestep.learning import make_options
-    from sidestep.learning.records import read_summary
-    from sidestep.store.files import OutputError, write_bytes
+    from sidestep.learning.records import writing
+    from sidestep.store.damage import damage_on_stderr
     from sidestep.store.outputs import try_outputs
-    from sidestep.trials.reproduction import reproduce as run_study
-    from sidestep.views import comparison_sections, markdown_tables, write_report
-    from sidestep.world import load_scenario
 
     try_outputs(files=[command.json], folders=[command.out])
-    try:
-        studies = run_study(
-            command.out,
-            scenario=load_scenario("paper", **parse_overrides(command.set)),
-            shields=command.shields,
-            pursuer=command.pursuer,
-            seed=command.seed,
-            episodes=command.episodes,
-            evaluation_episodes=command.evaluation_episodes,
-            options=make_options(**parse_overrides(command.learner)),
-            resume=command.resume,
-            training_progress=lambda shield: TrainingBar(console, f"training, {shield}"),
-            count_progress=lambda label: CountBar(console, label),
-        )
-    except KeyboardInterrupt:
-        console.print(f"Interrupted. Continue with: sidestep reproduce --out {command.out} --resume")
-        return 130
-    except OutputError as error:
-        advice = advised(error, command.out, "reproduce", "--out", command.out, "--resume")
-        raise advice from error.__cause__
+    resume = command.resume and (command.out / "config.json").is_file()
+    going = going_on(console, command.out, *resume_words("reproduce", command.out, command.json))
+    with going, damage_on_stderr(), writing(command.out, resume=resume):
+        _study(command, resume, console)
+    return 0
+
+
+def _study(command: Reproduce, resume: bool, console: Console) -> None:
+    """The study, its tables and its report."""
+    from sidestep.learning.records import read_summary
+    from sidestep.store.files import write_bytes
+    from sidestep.trials.reproduction import reproduce as run_study
+    from sidestep.trials.reproduction import study_settings
+    from sidestep.views import comparison_sections, markdown_tables, write_report
+
+    stored = study_settings(command.out) if resume else None
+    settings = settings_from(
+        command, "shields", "pursuer", "seed", "episodes", "evaluation_episodes", stored=stored
+    )
+    settings["scenario"] = scenario_from(command, settings.get("scenario"))
+    settings["options"] = options_from(command, settings.get("options"))
+    studies = run_study(
+        command.out,
+        **settings,
+        resume=resume,
+        training_progress=lambda shield: TrainingBar(console, f"training, {shield}"),
+        count_progress=lambda label: CountBar(console, label),
+    )
     summary = read_summary(command.out)
     sections = comparison_sections(summary)
     console.print("Columns: what the paper reports, then our measurements under each shield.\n")
@@ -99,11 +106,10 @@ def run(command: Reproduce, console: Console) -> int:
     report = write_report(
         [study.folder for study in studies],
         command.out / "report.html",
-        command=command_line(command),
+        command=command_line(_as_begun(command, settings) if resume else command),
     )
     write_json_file(command.json, summary)
     console.print(f"Report with figures: {report}")
-    return 0
 
 
 def comparison_tables(sections: list[Section]) -> Iterator[Any]:
@@ -122,6 +128,22 @@ def comparison_tables(sections: list[Section]) -> Iterator[Any]:
         for label, cells in section.rows:
             table.add_row(label, *cells, style="dim" if label.startswith(" ") else "")
         yield table
+
+
+def _as_begun(command: Reproduce, settings: Mapping[str, Any]) -> Reproduce:
+    """The command that the study of a resumed one was begun with."""
+    from sidestep.learning import make_options, options_to_dict
+    from sidestep.world import load_scenario, scenario_to_dict
+
+    def changed(values: Mapping[str, Any], plain: Mapping[str, Any]) -> tuple[str, ...]:
+        return tuple(f"{name}={json.dumps(value)}" for name, value in values.items() if value != plain[name])
+
+    return replace(
+        command,
+        set=changed(scenario_to_dict(settings["scenario"]), scenario_to_dict(load_scenario("paper"))),
+        learner=changed(options_to_dict(settings["options"]), options_to_dict(make_options())),
+        **{name: value for name, value in settings.items() if name not in ("scenario", "options")},
+    )
 
 
 def command_line(command: Reproduce) -> str:

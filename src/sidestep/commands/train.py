@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sidestep._program import command as command_line
 from sidestep.commands.common import (
     Overrides,
     PursuerName,
@@ -13,7 +14,12 @@ from sidestep.commands.common import (
     ShieldName,
     TrainingBar,
     going_on,
-    parse_overrides,
+    options_from,
+    resume_words,
+    say,
+    scenario_from,
+    settings_from,
+    unless_given,
     write_json_file,
 )
 
@@ -27,56 +33,56 @@ class Train:
 
     out: Path
     """Run folder to write; never overwritten silently."""
-    scenario: ScenarioName = "paper"
+    scenario: ScenarioName = unless_given("paper")
     """Preset (paper, paper-test, quadrotor, quadrotor-test) or a TOML or JSON file."""
-    shield: ShieldName = "joint"
+    shield: ShieldName = unless_given("joint")
     """Shield during training: none, paper, game or joint."""
-    pursuer: PursuerName = "nash"
+    pursuer: PursuerName = unless_given("nash")
     """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; for what
     cannot turn on the spot chauffeur."""
-    episodes: int = 200
-    """Episodes to train for; with --resume the new total."""
-    seed: int = 0
+    episodes: int = unless_given(200)
+    """Episodes to train for; with --resume a larger number trains on to that total."""
+    seed: int = unless_given(0)
     """Seed of everything random; the same seed gives the same run on the same machine."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""
     learner: Overrides = ()
     """Training options to change, such as discount=0.98 updates_per_decision=3."""
     resume: bool = False
-    """Continue the run in --out where it stopped, bit for bit; its own settings are used."""
+    """Continue the run in --out where it stopped, bit for bit, with the settings it was begun with. Other
+    options beside it must agree with those."""
     json: Path | None = None
     """Also write the summary to this file."""
 
 
 def run(command: Train, console: Console) -> int:
     """Run `sidestep train`; returns the exit status."""
-    from sidestep.learning import make_options, resume_settings
+    from sidestep.learning import resume_settings
     from sidestep.learning import train as run_training
+    from sidestep.store.damage import damage_on_stderr
     from sidestep.store.outputs import try_outputs
-    from sidestep.world import load_scenario
 
     try_outputs(files=[command.json], folders=[command.out])
-    if command.resume:
-        settings = resume_settings(command.out)
-        settings["episodes"] = max(settings["episodes"], command.episodes)
-    else:
-        settings = {
-            "scenario": load_scenario(command.scenario, **parse_overrides(command.set)),
-            "shield": command.shield,
-            "pursuer": command.pursuer,
-            "seed": command.seed,
-            "episodes": command.episodes,
-            "options": make_options(**parse_overrides(command.learner)),
-        }
-    going = going_on(command.out, "train", "--out", command.out, "--resume")
-    with going, TrainingBar(console, f"training, {settings['shield']}") as show:
-        training = run_training(**settings, out=command.out, resume=command.resume, progress=show)
-    console.print(training_table(training.summary))
-    write_json_file(command.json, training.summary)
-    if training.interrupted:
-        console.print(f"Interrupted. Continue with: sidestep train --out {command.out} --resume")
-        return 130
-    console.print(f"Policy and summary in {command.out}; next: sidestep evaluate {command.out}")
+    going = going_on(console, command.out, *resume_words("train", command.out, command.json))
+    with going, damage_on_stderr():
+        stored = resume_settings(command.out) if command.resume else None
+        settings = settings_from(command, "shield", "pursuer", "seed", "episodes", stored=stored)
+        settings["scenario"] = scenario_from(command, settings.get("scenario"))
+        settings["options"] = options_from(command, settings.get("options"))
+        with TrainingBar(console, f"training, {settings['shield']}") as show:
+            training = run_training(**settings, out=command.out, resume=command.resume, progress=show)
+        console.print(training_table(training.summary))
+        write_json_file(command.json, training.summary)
+        if training.interrupted:
+            raise KeyboardInterrupt
+    if training.had_ended:
+        more = command_line("train", "--out", command.out, "--resume", "--episodes", 2 * settings["episodes"])
+        say(console, f"{command.out} had its {settings['episodes']} episodes already. To train on: {more}")
+        return 0
+    say(
+        console,
+        f"Policy and summary in {command.out}; next: {command_line('evaluate', command.out)}",
+    )
     return 0
 
 

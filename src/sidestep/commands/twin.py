@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -86,6 +87,13 @@ class Twin:
 
 def run(command: Twin, console: Console) -> int:
     """Run `sidestep twin`; returns the exit status."""
+    from sidestep.store.lock import hold
+
+    with nullcontext() if command.out is None else hold(command.out):
+        return _run(command, console)
+
+
+def _run(command: Twin, console: Console) -> int:
     from dataclasses import replace
 
     from sidestep.bridges.onboard import Onboard

@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import re
+import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sidestep.learning.records import RunError
+from sidestep.store.damage import DamageWarning
 from sidestep.store.files import write_bytes
 
 _NAME = re.compile(r"episodes-(\d+)\.npz")
@@ -134,6 +136,7 @@ def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> 
     """Write the training state after the episodes it has seen; the two newest checkpoints are kept."""
     folder = Path(folder) / "checkpoints"
     episodes = int(state.episodes)
+    folder.mkdir(exist_ok=True)
     path = folder / f"episodes-{episodes:06d}.npz"
     filled = min(int(state.replay.written), state.replay.capacity)
     write_arrays(
@@ -157,18 +160,42 @@ def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> 
 def list_checkpoints(folder: str | Path) -> list[Path]:
     """Checkpoints of a run, oldest first."""
     found = [path for path in (Path(folder) / "checkpoints").glob("*.npz") if _NAME.fullmatch(path.name)]
-    return sorted(found, key=lambda path: int(_NAME.fullmatch(path.name).group(1)))  # type: ignore[union-attr]
+    return sorted(found, key=_episodes_of)
+
+
+def _episodes_of(path: Path) -> int:
+    return int(_NAME.fullmatch(path.name).group(1))  # type: ignore[union-attr]
 
 
 def read_checkpoint(folder: str | Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
-    """The newest checkpoint of a run that is whole; one damaged on disk falls back on the one before it.
+    """The newest checkpoint of a run that is whole.
+
+    One that is damaged on disk falls back on the one before it, with a `DamageWarning` that says which file
+    is damaged, from which episode the run goes on, and what was lost.
 
     **Raises** `CheckpointError` when there is none, or none that fits `example`.
     """
-    problem: CheckpointError | None = None
+    problems: list[CheckpointError] = []
     for path in reversed(list_checkpoints(folder)):
         try:
-            return read_arrays(path, example)
+            found = read_arrays(path, example)
         except CheckpointError as error:
-            problem = problem or error
-    raise problem or CheckpointError(f"{folder} has no checkpoint any more; start another run with --out")
+            problems.append(error)
+            continue
+        if problems:
+            begin, lost = _episodes_of(path), _episodes_of(list_checkpoints(folder)[-1]) - _episodes_of(path)
+            warnings.warn(
+                f"{'; '.join(map(str, problems))}. The training goes on from {path.name}, after episode "
+                f"{begin}. Lost: the {lost} episodes after it, which are trained again (the same seed gives "
+                "the same episodes)",
+                DamageWarning,
+                stacklevel=2,
+            )
+        return found
+    if not problems:
+        raise CheckpointError(f"{folder} has no checkpoint any more; start another run with --out")
+    if len(problems) > 1:
+        raise CheckpointError(
+            f"{'; '.join(map(str, problems))}. No older checkpoint is left: start another run with --out"
+        )
+    raise problems[0]

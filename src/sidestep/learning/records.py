@@ -6,13 +6,15 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sidestep.store import files
 from sidestep.store.files import (
     UnreadableError,
     append_bytes,
@@ -21,8 +23,8 @@ from sidestep.store.files import (
     read_json,
     write_bytes,
     write_json,
-    writing,
 )
+from sidestep.store.lock import LOCK, FolderInUseError, hold, is_vacant
 
 OUTCOMES = ("captured", "collided", "reached", "timed_out")
 """How an episode ends; exclusive, the first that applies."""
@@ -33,6 +35,7 @@ CONVERGENCE_RETURN = 940.0
 """Mean return that counts as converged: with +1000 for the target, at least 19 of 20 reached."""
 
 _CONFIG, _METRICS, _SUMMARY = "config.json", "metrics.jsonl", "summary.json"
+_KINDS = {"run": "training", "study": "reproduction", "falsification": "search for counterexamples"}
 
 
 NOT_BEGUN = "leave out --resume to start one there"
@@ -52,58 +55,138 @@ def _read(path: Path) -> Any:
         raise RunError(f"{error}{missing}") from None
 
 
+@contextmanager
+def writing(folder: str | Path, *inner: str, resume: bool = False) -> Iterator[None]:
+    """Hold a run folder, and the folders of these names in it, for as long as it is written; see `hold`.
+
+    **Raises** `RunError` when there is something in a new one, or nothing to resume, before anything is
+    touched; `FolderInUseError` when another process writes there.
+    """
+    folder = Path(folder)
+    if resume:
+        open_run(folder, otherwise=NOT_BEGUN)
+    else:
+        _refuse_occupied(folder)
+    with hold(folder, *(folder / name for name in inner)):
+        _sweep(folder)
+        yield
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what kills in the middle of `whole_file` have left: files of processes that are gone."""
+    for torn in folder.rglob(".*.tmp"):
+        process = torn.suffixes[-2].removeprefix(".") if len(torn.suffixes) > 1 else ""
+        if process.isdigit() and not _runs(int(process)):
+            torn.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def held_if_run(folder: str | Path) -> AbstractContextManager[None]:
+    """Hold the folder if there is a run in it, for what is added to one later; see `hold`."""
+    return hold(folder) if (Path(folder) / _CONFIG).is_file() else nullcontext()
+
+
 def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
     """A new run folder with `config.json` and empty `checkpoints/` and `figures/`.
 
     **Raises** `RunError` when there is anything in `folder` already: nothing is ever overwritten silently.
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise RunError(f"{folder} is a file, not a folder; choose another --out")
-    if folder.is_dir() and not all(_is_left_by_a_kill(entry) for entry in folder.iterdir()):
-        what = "a run" if (folder / _CONFIG).exists() else "files"
-        raise RunError(
-            f"{folder} already holds {what}, which would be overwritten; continue a run with --resume, "
-            "or choose another --out"
-        )
+    _refuse_occupied(folder)
     for name in ("checkpoints", "figures"):
         make_folder(folder / name)
     write_json(folder / _CONFIG, config)
     return folder
 
 
+def _refuse_occupied(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise RunError(f"{folder} is a file, not a folder; choose another --out")
+    if not folder.is_dir() or all(map(_is_left_by_a_kill, folder.iterdir())):
+        return
+    if (folder / LOCK).exists():
+        try:
+            with hold(folder):
+                pass
+        except FolderInUseError:
+            raise
+        except ValueError:
+            pass  # It cannot be written in, which is not what is wrong first.
+    what = "a run" if (folder / _CONFIG).exists() else "files"
+    raise RunError(
+        f"{folder} already holds {what}, which would be overwritten; continue a run with --resume, "
+        "or choose another --out"
+    )
+
+
 def _is_left_by_a_kill(entry: Path) -> bool:
-    """Whether this is what `create_run` leaves when it is killed before `config.json` is in place."""
-    if entry.name in ("checkpoints", "figures"):
-        return entry.is_dir() and not any(entry.iterdir())
-    return entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp"
+    """Whether this is what is left when `create_run` is killed before `config.json` is in place."""
+    return is_vacant(entry) or (entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp")
 
 
-def open_run(folder: str | Path, otherwise: str = "") -> dict[str, Any]:
+def open_run(folder: str | Path, kind: str | None = None, otherwise: str = "") -> dict[str, Any]:
     """The configuration of an existing run.
 
-    **Raises** `RunError` when `folder` holds none; `otherwise` says what to do then.
+    **Arguments:** `kind` what it must be: `run` (a training), `study` or `falsification`; anything if None.
+
+    **Raises** `RunError` when `folder` holds none, or one of another kind; `otherwise` says what to do then.
     """
-    folder = Path(folder)
+    folder, advice = Path(folder), f"; {otherwise}" if otherwise else ""
     if not (folder / _CONFIG).is_file():
         what = f"holds no run (no {_CONFIG})" if folder.exists() else "does not exist"
-        raise RunError(f"{folder} {what}" + (f"; {otherwise}" if otherwise else ""))
-    for name in ("checkpoints", "figures"):
-        make_folder(folder / name)
-    return _read(folder / _CONFIG)
+        raise RunError(f"{folder} {what}{advice}")
+    config = _read(folder / _CONFIG)
+    if kind is not None and (found := _kind_of(config)) != kind:
+        raise RunError(f"{folder} holds no {_KINDS[kind]} but a {_KINDS[found]}{advice}")
+    return config
+
+
+def _kind_of(config: Mapping[str, Any]) -> str:
+    return str(config.get("kind", "study" if "study" in config else "run"))
+
+
+def refuse_changes(
+    folder: str | Path, stored: Mapping[str, Any], asked: Mapping[str, Any], names: Iterable[str]
+) -> None:
+    """Compare what is asked for with what the run in `folder` was begun with (`stored`), setting by setting.
+
+    **Raises** `RunError` with the first of `names` that differs, and both values.
+    """
+    for name in names:
+        was, now = json_safe(stored.get(name)), json_safe(asked[name])
+        if was == now:
+            continue
+        what = name
+        if isinstance(was, Mapping) and isinstance(now, Mapping):
+            entry = next(key for key in [*was, *now] if was.get(key) != now.get(key))
+            what, was, now = f"{name}, {entry}", was.get(entry), now.get(entry)
+        raise RunError(
+            f"{folder} was begun with other settings: {what} = {was!r}, not {now!r}; resume without changing "
+            "it, or start anew with another --out"
+        )
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
-    """The episodes of a run in order; none when it has no metrics yet.
+    """The episodes of a run in order, or the rounds of a search; none when it has no metrics yet.
 
     A last line that was cut off by a kill is left out. **Raises** `RunError` naming any other line that
-    cannot be read.
+    cannot be read, or is not the next of its kind.
     """
     path = Path(folder) / _METRICS
     if not path.exists():
         return []
     *lines, _cut = path.read_bytes().split(b"\n")
-    metrics = []
+    metrics: list[dict[str, Any]] = []
+    counts: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):
         try:
             entry = json.loads(line)
@@ -111,15 +194,39 @@ def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
             entry = None
         if not isinstance(entry, dict):
             raise RunError(f"line {number} of {path} is not a JSON object; the file was damaged or edited")
+        _check_next(entry, counts, f"line {number} of {path}")
         metrics.append(entry)
     return metrics
+
+
+def _check_next(entry: Mapping[str, Any], counts: dict[str, int], where: str) -> None:
+    """**Raises** `RunError` unless this is the next episode of a training, or the next round of an attack."""
+    if "episode" in entry:
+        series, what, number, first = "episode", "episode", entry["episode"], 1
+    elif "round" in entry:
+        series, what, number, first = (
+            str(entry.get("attack")),
+            f"{entry.get('attack')} round",
+            entry["round"],
+            0,
+        )
+    else:
+        return
+    expected = counts.get(series, first)
+    if number != expected:
+        raise RunError(
+            f"{where} is {what} {number} where {what} {expected} belongs: two programs wrote the file at the "
+            "same time, or it was edited. Figures from it would be wrong. Restore the file, or start again "
+            "with another --out: the same seed gives the same numbers"
+        )
+    counts[series] = expected + 1
 
 
 def append_metrics(folder: str | Path, episodes: Iterable[Mapping[str, Any]]) -> None:
     """Append one line per episode and sync to disk; a last line cut off by a kill is removed first."""
     path = Path(folder) / _METRICS
     text = "".join(json.dumps(json_safe(episode), allow_nan=False) + "\n" for episode in episodes)
-    with writing(path), open(path, "ab+") as file:
+    with files.writing(path), open(path, "ab+") as file:
         end = _end_of_last_line(file)
         if end < file.seek(0, os.SEEK_END):
             file.truncate(end)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, wri
 from sidestep.learning.curves import Curves
 from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
-from sidestep.learning.policy import LearnedPolicy, write_policy
+from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
 from sidestep.learning.training import Report, TrainState, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
@@ -47,7 +47,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class Training:
-    """What a training gave: policy, `summary.json`, one entry per episode, and the state it ended in."""
+    """What a training gave: policy, `summary.json`, one entry per episode, and the state it ended in.
+
+    `had_ended`: it was resumed, but there was nothing left to do.
+    """
 
     policy: LearnedPolicy
     summary: dict[str, Any]
@@ -56,6 +59,7 @@ class Training:
     interrupted: bool = False
     folder: Path | None = None
     chunk_seconds: list[tuple[int, float]] = field(default_factory=list)
+    had_ended: bool = False
 
 
 def _capacity(options: TrainingOptions, scenario: Scenario, episodes: int) -> int:
@@ -97,9 +101,9 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
 def resume_settings(folder: str | Path) -> dict[str, Any]:
     """What `train` needs to continue a run as it was begun: scenario, shield, pursuer, seed and the like.
 
-    **Raises** `RunError` when `folder` holds no run.
+    **Raises** `RunError` when `folder` holds no training.
     """
-    config = records.open_run(folder, records.NOT_BEGUN)
+    config = records.open_run(folder, "run", records.NOT_BEGUN)
     fields = dict(config["scenario"])
     # The stored fields are complete, so whichever preset they start from leaves no trace.
     return {
@@ -138,10 +142,14 @@ def train(
     scenario, shield, pursuer, seed and options must be the ones given (`resume_settings` reads them) while
     `episodes` may be larger; `progress` is called after every chunk of `chunk` decisions.
 
+    The folder is held until the last file is written. A run that has its episodes already is left as it is.
+    A damaged checkpoint is passed over with a `DamageWarning`.
+
     **Raises** `ValueError` for a bad argument, `RunError` when `out` already holds something and `resume` is
-    not set, or holds nothing to resume, `OutputError` when the run cannot be written any more, and `Diverged`
-    when networks, losses or actions are no longer finite. The newest checkpoint stays then, of the last chunk
-    in which all was well, and the run can be resumed from it.
+    not set, holds nothing to resume, or was begun with other settings; `FolderInUseError` when someone else
+    writes there; `OutputError` when the run cannot be written any more, and `Diverged` when networks, losses
+    or actions are no longer finite. Then the newest checkpoint from before that stays, and the run can be
+    resumed from it.
     """
     whole_number("episodes", episodes), whole_number("chunk", chunk), seed_number(seed)
     options = make_options() if options is None else options
@@ -157,17 +165,41 @@ def train(
         "version": sidestep.__version__,
     }
     folder = None if out is None else Path(out)
+    with nullcontext() if folder is None else records.writing(folder, resume=resume):
+        return _run(
+            scenario, guard, hunter, options, capacity, config, folder, resume, progress, checkpoint_seconds,
+            chunk,
+        )  # fmt: skip
+
+
+def _run(
+    scenario: Scenario,
+    guard: Any,
+    hunter: Any,
+    options: TrainingOptions,
+    capacity: int,
+    config: dict[str, Any],
+    folder: Path | None,
+    resume: bool,
+    progress: Callable[[Progress], None] | None,
+    checkpoint_seconds: float,
+    chunk: int,
+) -> Training:
+    """The training itself, its folder held."""
+    episodes = int(config["episodes"])
     if folder is not None and resume:
         _check_same_run(folder, config)
     elif folder is not None:
         records.create_run(folder, config)
-    state = start(scenario, guard, options, jax.random.key(seed), capacity)
+    state = start(scenario, guard, options, jax.random.key(config["seed"]), capacity)
     metrics: list[dict[str, Any]] = []
     earlier = 0.0
     if folder is not None and resume:
         state, earlier = _reopen(folder, config, state)
         check_networks(state.learner, folder)
         metrics = records.read_metrics(folder)
+        if (ended := _ended_before(folder, state, metrics, episodes)) is not None:
+            return ended
     elif folder is not None:
         write_checkpoint(folder, state, wall_seconds=0.0)
 
@@ -250,13 +282,8 @@ def _kept(folder: Path) -> str:
 
 def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
     """**Raises** `RunError` naming what differs from the run that `folder` holds."""
-    stored = records.open_run(folder, records.NOT_BEGUN)
-    for name in ("scenario", "learner", "shield", "pursuer", "seed"):
-        if json_safe(stored.get(name)) != json_safe(config[name]):
-            raise records.RunError(
-                f"{folder} was begun with another {name}: {stored.get(name)!r}, not {config[name]!r}; "
-                "resume without changing it, or start another run with --out"
-            )
+    stored = records.open_run(folder, "run", records.NOT_BEGUN)
+    records.refuse_changes(folder, stored, config, ("scenario", "learner", "shield", "pursuer", "seed"))
     if config["episodes"] < stored["episodes"]:
         raise records.RunError(
             f"{folder} was begun for {stored['episodes']} episodes; it cannot be resumed for fewer "
@@ -268,11 +295,28 @@ def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tup
     """The state to continue from, the run's files cut back to it."""
     if not list_checkpoints(folder) and not records.read_metrics(folder):
         # Killed before its first checkpoint: it resumes at its start.
-        return example, 0.0
-    state, manifest = read_checkpoint(folder, example)
-    records.truncate_metrics(folder, int(state.episodes))
-    write_json(folder / "config.json", config)
-    return state, float(manifest["wall_seconds"])
+        state, wall_seconds = example, 0.0
+    else:
+        state, manifest = read_checkpoint(folder, example)
+        wall_seconds = float(manifest["wall_seconds"])
+        if len(records.read_metrics(folder)) != int(state.episodes):
+            records.truncate_metrics(folder, int(state.episodes))
+    if records.open_run(folder)["episodes"] != config["episodes"]:
+        write_json(folder / "config.json", config)
+    return state, wall_seconds
+
+
+def _ended_before(
+    folder: Path, state: TrainState, metrics: list[dict[str, Any]], episodes: int
+) -> Training | None:
+    """What a run that has its episodes and all its files already gave; None if anything is left to do."""
+    try:
+        policy, summary = load_policy(folder), records.read_summary(folder)
+    except records.RunError:
+        return None
+    if int(state.episodes) < episodes or summary.get("episodes") != episodes:
+        return None
+    return Training(policy, summary, metrics, state, folder=folder, had_ended=True)
 
 
 def _progress(metrics: list[dict[str, Any]], state: TrainState, episodes: int, rate: float) -> Progress:

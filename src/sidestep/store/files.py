@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from sidestep import _interrupts
+
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _STREAMS = {"/dev/stdin": 0, "/dev/stdout": 1, "/dev/stderr": 2}
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
@@ -159,7 +161,8 @@ def whole_file(path: str | Path, needed: int | None = None) -> Iterator[Path]:
         place.parent.mkdir(parents=True, exist_ok=True)
         beside = place.with_name(f".{place.name}.{os.getpid()}.tmp")
         try:
-            yield beside
+            with _interrupts.before_leaving(lambda: beside.unlink(missing_ok=True)):
+                yield beside
             with open(beside, "rb+") as file:
                 os.fsync(file.fileno())
             os.replace(beside, place)

@@ -112,6 +112,20 @@ def _recorded(path: Path, run: Callable[[], Trajectory]) -> Trajectory:
     return load_trajectory(path)
 
 
+def study_settings(folder: str | Path) -> dict[str, Any]:
+    """What `reproduce` needs to continue the study in `folder` as it was begun.
+
+    **Raises** `RunError` when there is none.
+    """
+    config = records.open_run(folder, "study")
+    return {
+        "scenario": load_scenario("paper", **config["scenario"]),
+        "shields": tuple(config["study"]),
+        "options": make_options(**config["learner"]),
+        **{name: config[name] for name in ("pursuer", "seed", "episodes", "evaluation_episodes")},
+    }
+
+
 def reproduce(
     out: str | Path,
     *,
@@ -129,11 +143,13 @@ def reproduce(
     """Train under each shield, measure the trained and the untrained policy, run the paper's test scene.
 
     Writes one run folder per shield in `out`, and `summary.json` with everything side by side. Each part is
-    kept once finished, so `resume` goes on where an interrupted study stopped. Test starts come from
-    another key than training starts.
+    kept once finished, so `resume` goes on where an interrupted study stopped, with the settings it was begun
+    with (`study_settings` reads them). Test starts come from another key than training starts. `out` and the
+    run folders are held until the last file is written.
 
     **Raises** `RunError` when `out` already holds something and `resume` is not set, or the study in it was
-    begun with other settings; `ValueError` for bad arguments; `KeyboardInterrupt` when interrupted.
+    begun with other settings; `FolderInUseError` when someone else writes in it or in one of its run folders;
+    `ValueError` for bad arguments; `KeyboardInterrupt` when interrupted.
     """
     scenario = load_scenario("paper") if scenario is None else scenario
     options = make_options() if options is None else options
@@ -156,9 +172,27 @@ def reproduce(
         "evaluation_episodes": evaluation_episodes,
         "version": sidestep.__version__,
     }
-    if resume and (out / "config.json").exists():
-        if records.open_run(out) != json_safe(config):
-            raise records.RunError(f"{out} was begun with other settings; use the same, or another --out")
+    resume = resume and (out / "config.json").exists()
+    with records.writing(out, *shields, resume=resume):
+        return _run(out, config, scenario, scene, options, resume, training_progress, count_progress)
+
+
+def _run(
+    out: Path,
+    config: dict[str, Any],
+    scenario: Scenario,
+    scene: Scenario,
+    options: TrainingOptions,
+    resume: bool,
+    training_progress: Hook,
+    count_progress: Hook,
+) -> list[ShieldStudy]:
+    """The study itself, its folders held."""
+    shields, pursuer, seed = config["study"], config["pursuer"], config["seed"]
+    episodes, evaluation_episodes = config["episodes"], config["evaluation_episodes"]
+    if resume:
+        names = [name for name in config if name != "version"]
+        records.refuse_changes(out, records.open_run(out, "study"), config, names)
     else:
         records.create_run(out, config)
 
@@ -175,6 +209,9 @@ def reproduce(
                 )  # fmt: skip
             if training.interrupted:
                 raise KeyboardInterrupt
+        else:
+            # Trained on by itself meanwhile, it would no longer be what the others are compared with.
+            records.refuse_changes(folder, records.open_run(folder), config, ("episodes",))
         policy = load_policy(folder)
 
         def measure(policy: Any, label: str, shield: str = shield, folder: Path = folder) -> dict[str, Any]:

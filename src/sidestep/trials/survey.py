@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sidestep.learning import load_policy
-from sidestep.learning.records import OUTCOMES, RunError, open_run
+from sidestep.learning.records import OUTCOMES, RunError, held_if_run, open_run
 from sidestep.store.files import read_json, write_bytes
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.intervention_map import InterventionMap
@@ -134,8 +134,15 @@ def survey_run(
 
 
 def save_survey(folder: str | Path, survey: Survey) -> None:
-    """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all."""
-    folder = Path(folder)
+    """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all.
+
+    **Raises** `FolderInUseError` when someone else writes there.
+    """
+    with held_if_run(folder):
+        _save(Path(folder), survey)
+
+
+def _save(folder: Path, survey: Survey) -> None:
     scenario, about = _told(folder)
     for episode in survey.worst:
         save_trajectory(_worst_path(folder, episode.number), episode.trajectory, scenario, about)

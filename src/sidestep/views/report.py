@@ -12,6 +12,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import sidestep
+from sidestep.learning.records import held_if_run
 from sidestep.pursuit import CaptureGame
 from sidestep.store.files import write_bytes
 from sidestep.views.html import shown_number, shown_value
@@ -54,13 +55,19 @@ def write_report(
     capture are those of its first run that has one. `path` the HTML file; `figures` the folder for the
     figures as PNG and PDF (`figures` beside `path` if not given); `command` what to type to run it again.
 
-    **Raises** `ValueError` without a run, `RunError` for a folder that holds none.
+    **Raises** `ValueError` without a run, `RunError` for a folder that holds none, `FolderInUseError` when
+    `path` lies in a run folder that someone else writes in.
     """
     if not runs:
         raise ValueError("a report needs at least one run")
     loaded = [run if isinstance(run, Run) else load_run(run) for run in runs]
     path = Path(path)
     folder = path.parent / "figures" if figures is None else Path(figures)
+    with held_if_run(path.parent):
+        return _write(loaded, path, folder, command)
+
+
+def _write(loaded: Sequence[Run], path: Path, folder: Path, command: str | None) -> Path:
     safety_table(loaded, folder / "safety")
     content = _content(loaded, folder) | {"command": command}
     environment = Environment(

@@ -66,13 +66,15 @@ def run_on_worker(
     from distributed import get_worker
 
     import sidestep
+    from sidestep.store.damage import damage_on_stderr
 
     if sidestep.__version__ != version:
         raise RuntimeError(f"the worker has sidestep {sidestep.__version__}, the command {version}")
     with _ONE_AT_A_TIME:
         worker = get_worker()
         take_cores(worker.state.nthreads, worker.name)
-        return run_once(task, folder, token, run)
+        with damage_on_stderr():
+            return run_once(task, folder, token, run)
 
 
 def run_once(

@@ -10,6 +10,7 @@ import platform
 import socket
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 
 from sidestep.learning.records import summarise
 from sidestep.store.files import json_safe
+from sidestep.store.lock import hold
 
 KINDS = ("evaluate", "train")
 AXES = ("scenario", "shield", "pursuer", "policy", "learner", "seed")
@@ -159,11 +161,13 @@ def _run_train(task: Task, folder: Path | None) -> dict[str, Any]:
 
     settings = task.settings
     scenario = load_scenario("paper", **settings["scenario"])
-    training = train(
-        scenario, shield=settings["shield"], pursuer=settings["pursuer"], seed=settings["seed"],
-        episodes=settings["episodes"], options=make_options(**settings["learner"]), out=folder,
-        resume=folder is not None and (folder / "config.json").exists(),
-    )  # fmt: skip
+    # Someone may be at it by hand: the job waits for them, and goes on from there.
+    with nullcontext() if folder is None else hold(folder, wait=True):
+        training = train(
+            scenario, shield=settings["shield"], pursuer=settings["pursuer"], seed=settings["seed"],
+            episodes=settings["episodes"], options=make_options(**settings["learner"]), out=folder,
+            resume=folder is not None and (folder / "config.json").exists(),
+        )  # fmt: skip
     if training.interrupted:
         raise KeyboardInterrupt
     evaluation = evaluate(

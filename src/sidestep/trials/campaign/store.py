@@ -8,13 +8,13 @@ import hashlib
 import json
 import os
 import uuid
+import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
+from sidestep.store.damage import DamageWarning
 from sidestep.store.files import (
     json_safe,
     make_folder,
@@ -24,6 +24,7 @@ from sidestep.store.files import (
     write_json,
     writing,
 )
+from sidestep.store.lock import hold, hold_files, is_vacant
 
 _FORMAT = 1
 _CANNOT_LINK = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
@@ -72,31 +73,25 @@ class Store:
     def alone(self) -> Iterator[None]:
         """While this lasts, no other command works on the folder; a killed one no longer does.
 
-        **Raises** `ValueError` when another does, or the folder holds something else than a campaign.
+        **Raises** `FolderInUseError` when another does, `ValueError` when the folder holds something else.
         """
         self._refuse_what_is_not_ours()
-        make_folder(self.folder)
-        try:
-            with FileLock(self.folder / "campaign.lock", timeout=0):
-                yield
-        except Timeout:
-            raise ValueError(
-                f"another sidestep campaign is at work in {self.folder}; wait for it, or choose another --out"
-            ) from None
+        with hold(self.folder):
+            yield
 
     def _refuse_what_is_not_ours(self) -> None:
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"{self.folder} is a file, not a folder; choose another --out")
         if not self.folder.is_dir() or self.token is not None:
             return
-        # What a kill leaves before `campaign.json` is in place.
+        # What a kill leaves before `campaign.json` is in place; the first is that of earlier versions.
         begun = ("campaign.lock", ".campaign.json.")
-        if not all(entry.name.startswith(begun) for entry in self.folder.iterdir()):
+        if not all(is_vacant(entry) or entry.name.startswith(begun) for entry in self.folder.iterdir()):
             raise ValueError(f"{self.folder} holds other files and no campaign; choose another --out")
 
-    def lock(self, job: str) -> FileLock:
+    def lock(self, job: str) -> AbstractContextManager[None]:
         """Held by the process that runs the job: a worker taken for dead does not run it beside another."""
-        return FileLock(self.folder / "locks" / f"{job}.lock", poll_interval=0.2)
+        return hold_files(self.folder / "locks" / f"{job}.lock", wait=True)
 
     def run_folder(self, job: str) -> Path:
         """Where a training of this job is kept."""
@@ -115,8 +110,15 @@ class Store:
             return None
         record = _unsealed(content)
         if record is None or record.get("job") != job:
+            aside = path.with_suffix(".damaged")
             with contextlib.suppress(FileNotFoundError):
-                os.replace(path, path.with_suffix(".damaged"))
+                os.replace(path, aside)
+                warnings.warn(
+                    f"{path} is damaged and now called {aside.name}. Lost: the result of this job, which is "
+                    "run again",
+                    DamageWarning,
+                    stacklevel=2,
+                )
             return None
         return record
 

@@ -2,6 +2,7 @@
 
 from sidestep.trials.falsification.attacks import ATTACKS
 from sidestep.trials.falsification.chases import GOALS
+from sidestep.trials.falsification.continuing import search_settings
 from sidestep.trials.falsification.counterexamples import (
     Counterexample,
     CounterexampleError,
@@ -30,5 +31,6 @@ __all__ = [
     "judge",
     "read_counterexample",
     "replay",
+    "search_settings",
     "write_counterexample",
 ]

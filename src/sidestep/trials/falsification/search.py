@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ import numpy as np
 import sidestep
 from sidestep import _interrupts
 from sidestep._arrays import seed_number, whole_number
-from sidestep.learning.checkpoints import read_arrays, write_arrays
 from sidestep.learning.policy import load_policy
 from sidestep.learning.records import (
     NOT_BEGUN,
@@ -24,14 +23,19 @@ from sidestep.learning.records import (
     create_run,
     open_run,
     read_metrics,
+    read_summary,
+    refuse_changes,
+    write_json,
     write_summary,
+    writing,
 )
 from sidestep.safety import Shield, as_shield
 from sidestep.store.files import OutputError, json_safe, make_folder
+from sidestep.trials.falsification import learned_state as learned
 from sidestep.trials.falsification.attacks import ATTACKS, Round, make_attack
 from sidestep.trials.falsification.chases import GOALS, Target
+from sidestep.trials.falsification.continuing import budget_for, check_policy, plan_for
 from sidestep.trials.falsification.counterexamples import (
-    CUSTOM,
     Counterexample,
     describe_policy,
     make_counterexample,
@@ -50,12 +54,11 @@ from sidestep.trials.falsification.tallies import (
 )
 from sidestep.trials.falsification.verdict import judge
 from sidestep.trials.policies import GOAL_SEEKING, as_policy
-from sidestep.world import Scenario, load_scenario, scenario_to_dict
+from sidestep.world import Scenario, scenario_to_dict
 
 _WANTED = {"capture": ("captured",), "collision": ("collided",), "both": ("captured", "collided")}
 _EXAMINED = 16
 _DEEPER = 1e-4
-_DEFAULT_MINUTES = 3.0
 
 
 def check_plan(scenario: Scenario, plan: Plan) -> None:
@@ -95,27 +98,28 @@ def falsify(
     alone, through the one control step, before it is believed and kept (see `Plan.most`).
 
     **Arguments:** `policy` `goal-seeking`, a run folder or any policy; `shield` a name or a `Shield`; `out`
-    the folder to write; `minutes` to search for (3 unless `episodes` is given), when resuming on top of the
-    time it has had; `episodes` after which an attack ends; `resume` to go on with the search in `out`, whose
-    settings are used (a policy or shield without a name must be given again); `progress` is called after each
-    round.
+    the folder to write, held until the last file is written; `minutes` to search for (3 unless `episodes` is
+    given), when resuming on top of the time it has had; `episodes` after which an attack ends; `resume` to go
+    on with the search in `out`, whose settings must be the ones given (`search_settings` reads them; its plan
+    is used if none is given), for what is left of the time or the episodes it was begun for if neither is
+    given; `progress` is called after each round.
 
     Ctrl-C ends the search with what it has found.
 
     **Raises** `ValueError` for settings that make no sense (see `check_plan`), robots that are not the
-    built-in ones, a folder that is in use, or one to resume that holds no search.
+    built-in ones, or a folder that is taken or cannot be resumed so; `FolderInUseError` when someone else
+    writes there.
     """
     folder = Path(out)
     source = policy if isinstance(policy, (str, Path)) else None
-    if minutes is None and episodes is None:
-        minutes = _DEFAULT_MINUTES
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
         raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
     if episodes is not None:
         whole_number("episodes", episodes)
+    stored = open_run(folder, "falsification", NOT_BEGUN) if resume else None
+    if stored is not None:
+        plan = plan_for(stored, plan)
     plan = plan or Plan()
-    if resume:
-        scenario, source, shield, plan = _stored(folder, policy, shield)
     policy = _load(source) if source is not None else policy
     scenario.check_built_in(
         "the falsifier", "search with evaluate, over pursuers and starts, or falsify the problem that covers "
@@ -132,41 +136,25 @@ def falsify(
         "version": sidestep.__version__,
         **{name: getattr(plan, name) for name in Plan.__dataclass_fields__},
     }
-    if resume:
-        _check_policy(folder, about["policy"])
-    else:
-        create_run(folder, about)
-    make_folder(folder / "counterexamples")
-    hunt = _Hunt(folder, target, shield_called, about, plan, progress)
-    return hunt.run(minutes, episodes)
+    with writing(folder, resume=resume):
+        if stored is not None:
+            refuse_changes(folder, stored, about, ("scenario", "shield", *Plan.__dataclass_fields__))
+            check_policy(folder, stored["policy"], about["policy"])
+        else:
+            about["budget"] = budget_for(folder, {}, 0.0, minutes, episodes)
+            create_run(folder, about)
+        for name in ("counterexamples", "checkpoints", "figures"):
+            make_folder(folder / name)
+        hunt = _Hunt(folder, target, shield_called, about, plan, progress)
+        if stored is not None:
+            about["budget"] = budget_for(folder, stored.get("budget", {}), hunt.before, minutes, episodes)
+            if about["budget"] != stored.get("budget"):
+                write_json(folder / "config.json", about)
+        return hunt.run()
 
 
 def _load(source: str | Path) -> Any:
     return source if source == GOAL_SEEKING else load_policy(source)
-
-
-def _stored(folder: Path, policy: Any, shield: Any) -> tuple[Scenario, Any, Any, Plan]:
-    """Scenario, policy's source, shield and plan of a search begun before."""
-    config = open_run(folder, NOT_BEGUN)
-    if config.get("kind") != "falsification":
-        raise RunError(
-            f"{folder} holds no search for counterexamples; leave out --resume, or name its folder"
-        )
-    scenario = load_scenario("paper", **config["scenario"])
-    values = {name: config[name] for name in Plan.__dataclass_fields__}
-    values["attacks"] = tuple(values["attacks"])
-    shield = shield if config["shield"] == CUSTOM else config["shield"]
-    named = config["policy"]["name"]
-    source = named if named != CUSTOM else policy if isinstance(policy, (str, Path)) else None
-    return scenario, source, shield, Plan(**values)
-
-
-def _check_policy(folder: Path, policy: Mapping[str, Any]) -> None:
-    stored = open_run(folder)["policy"]
-    if stored.get("digest") != policy.get("digest"):
-        raise RunError(
-            f"{folder} was searched with other weights of the policy {stored['name']}; start another search"
-        )
 
 
 class _Hunt:
@@ -190,7 +178,13 @@ class _Hunt:
         for line in read_metrics(folder):
             self.tallies[line["attack"]].add(line)
         self.before = sum(tally.seconds for tally in self.tallies.values())
-        self.states = {name: self._state(name) for name in plan.attacks}
+        # Rounds count from 0; the last number is left for what an attack begins with.
+        self.states = {
+            name: learned.restored(
+                folder, name, self.attacks[name].init(self._key(name, 2**31 - 1)), self.tallies[name].rounds
+            )
+            for name in plan.attacks
+        }
         self.began = time.perf_counter()
 
     @property
@@ -202,21 +196,12 @@ class _Hunt:
         attack = jax.random.fold_in(jax.random.key(self.plan.seed), ATTACKS.index(name))
         return jax.random.fold_in(attack, number)
 
-    def _state_file(self, name: str) -> Path:
-        return self.folder / "checkpoints" / f"{name}.npz"
-
-    def _state(self, name: str) -> Any:
-        # Rounds count from 0; the last number is left for what an attack begins with.
-        state = self.attacks[name].init(self._key(name, 2**31 - 1))
-        if state is not None and self.tallies[name].rounds and self._state_file(name).is_file():
-            state, _ = read_arrays(self._state_file(name), state)
-        return state
-
     @_interrupts.held()
-    def run(self, minutes: float | None, episodes: int | None) -> Falsification:
+    def run(self) -> Falsification:
         """Rounds until the time is over or every attack has played its episodes."""
-        budget = None if minutes is None else self.before + 60.0 * minutes
-        interrupted = False
+        minutes, episodes = self.about["budget"]["minutes"], self.about["budget"]["episodes"]
+        budget = None if minutes is None else 60.0 * minutes
+        interrupted, rounds = False, 0
         try:
             while budget is None or self.elapsed < budget:
                 _interrupts.check()
@@ -228,6 +213,7 @@ class _Hunt:
                     break
                 name = min(waiting, key=lambda name: self.tallies[name].seconds)
                 self._round(name)
+                rounds += 1
                 if self.progress is not None:
                     self.progress(Progress(name, self.tallies[name], self.tallies, self.elapsed, budget))
         except KeyboardInterrupt:
@@ -236,6 +222,8 @@ class _Hunt:
             with suppress(OutputError):
                 write_summary(self.folder, self._summary(True))
             raise error.and_kept(self._kept()) from error.__cause__
+        if not (rounds or interrupted) and (ended := self._ended_before()) is not None:
+            return Falsification(self.folder, ended, self.tallies, False, had_ended=True)
         summary = self._summary(interrupted)
         try:
             write_summary(self.folder, summary)
@@ -248,6 +236,14 @@ class _Hunt:
         found = sum(len(tally.kept) for tally in self.tallies.values())
         return f"Kept: {rounds} rounds of the search and {found} counterexamples in {self.folder}"
 
+    def _ended_before(self) -> dict[str, Any] | None:
+        """The summary of a search that had come to its end; None if it is not there."""
+        try:
+            summary = read_summary(self.folder)
+        except RunError:
+            return None
+        return None if summary.get("interrupted", True) else summary
+
     def _round(self, name: str) -> None:
         began, tally = time.perf_counter(), self.tallies[name]
         key = self._key(name, tally.rounds)
@@ -256,7 +252,7 @@ class _Hunt:
         kept, unconfirmed = self._keep(name, result)
         self.states[name] = state
         if state is not None:
-            write_arrays(self._state_file(name), state, rows=attack.rows(state), round=tally.rounds)
+            learned.keep(self.folder, name, state, attack.rows(state), tally.rounds)
         line = json_safe(
             {
                 "attack": name,

@@ -98,12 +98,16 @@ class Progress:
 
 @dataclass(frozen=True)
 class Falsification:
-    """A search and what it found. `folder/counterexamples` holds one file per counterexample kept."""
+    """A search and what it found. `folder/counterexamples` holds one file per counterexample kept.
+
+    `had_ended`: it was resumed, but had had its time or its episodes.
+    """
 
     folder: Path
     summary: Mapping[str, Any]
     tallies: Mapping[str, Tally]
     interrupted: bool
+    had_ended: bool = False
 
     @property
     def counterexamples(self) -> list[Path]:

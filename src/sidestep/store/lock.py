@@ -1,0 +1,171 @@
+"""Who writes in this folder? One at a time, and whoever comes second learns who the first is.
+
+The lock is the operating system's, on the file `.lock` in the folder: it ends with the process, however that
+ends. `.lock.json` beside it says who holds it, and its time of change is renewed while that process lives:
+where locks do not reach across a network file system, that tells a live holder on another host from a dead
+one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+LOCK = ".lock"
+_NOTE = ".json"
+_POLL_SECONDS = 0.2
+_SIGN_SECONDS = 10.0
+_SILENT_SECONDS = 60.0
+"""Without a sign of life for so long, a holder on another host counts as dead."""
+
+_held: dict[str, tuple[int, int]] = {}
+"""Process and thread that hold a lock file, by its real path."""
+
+
+class FolderInUseError(ValueError):
+    """Someone else writes in the folder; the message says who, where and since when."""
+
+
+def is_vacant(entry: Path) -> bool:
+    """Whether there is nothing here but what locks leave: a lock file, or a folder of nothing else."""
+    if entry.is_dir() and not entry.is_symlink():
+        return all(is_vacant(each) for each in entry.iterdir())
+    return entry.name in (LOCK, LOCK + _NOTE)
+
+
+@contextmanager
+def hold(*folders: str | Path, wait: bool = False) -> Iterator[None]:
+    """While this lasts, no other process or thread that asks writes in these folders.
+
+    Folders are made as needed, and taken away again if nothing was put there. The thread that holds a folder
+    may hold it again, inside.
+
+    **Arguments:** `wait` for whoever holds one instead of raising.
+
+    **Raises** `FolderInUseError` when another process or thread holds one of them, `ValueError` when one
+    cannot be written in.
+    """
+    with hold_files(*(Path(folder) / LOCK for folder in folders), wait=wait):
+        yield
+
+
+@contextmanager
+def hold_files(*files: str | Path, wait: bool = False) -> Iterator[None]:
+    """As `hold`, by the names of the lock files."""
+    ended = threading.Event()
+    with ExitStack() as stack:
+        notes = [
+            note for file in files if (note := stack.enter_context(_taken(Path(file), wait))) is not None
+        ]
+        if notes:
+            threading.Thread(target=_show_life, args=(notes, ended), daemon=True).start()
+            stack.callback(ended.set)
+        yield
+
+
+@contextmanager
+def _taken(file: Path, wait: bool) -> Iterator[Path | None]:
+    """Hold one lock file; gives the note beside it, None where this thread holds it already."""
+    name, me = os.path.realpath(file), (os.getpid(), threading.get_ident())
+    if _held.get(name) == me:
+        yield None
+        return
+    note = file.with_name(file.name + _NOTE)
+    made = [folder for folder in (file.parent, *file.parent.parents) if not folder.exists()]
+    lock = FileLock(file)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=-1 if wait else 0, poll_interval=_POLL_SECONDS)
+        try:
+            while (holder := _alive_elsewhere(file, note)) is not None:
+                if not wait:
+                    raise FolderInUseError(_who(file, holder))
+                time.sleep(_POLL_SECONDS)
+            note.write_text(json.dumps(_about_this_process()) + "\n", encoding="utf-8")
+        except BaseException:
+            lock.release()
+            raise
+    except Timeout:
+        raise FolderInUseError(_who(file, _read(note))) from None
+    except (OSError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"cannot write in {file.parent}: {reason}; choose another folder") from None
+    _held[name] = me
+    try:
+        yield note
+    finally:
+        # A fork inherits what is here, but holds nothing.
+        if os.getpid() == me[0]:
+            del _held[name]
+            note.unlink(missing_ok=True)
+            _take_away(made, file)
+            lock.release()
+
+
+def _take_away(made: list[Path], file: Path) -> None:
+    """Remove the folders that were made for the lock, if nothing else came there."""
+    with suppress(OSError):
+        if made and list(file.parent.iterdir()) == [file]:
+            file.unlink()
+        for folder in made:
+            folder.rmdir()
+
+
+def _about_this_process() -> dict[str, Any]:
+    since = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+    return {"process": os.getpid(), "host": socket.gethostname(), "since": since}
+
+
+def _read(note: Path) -> dict[str, Any]:
+    """What a note says; empty when there is none, or it is just being written."""
+    try:
+        about = json.loads(note.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return about if isinstance(about, dict) and {"process", "host", "since"} <= about.keys() else {}
+
+
+def _alive_elsewhere(file: Path, note: Path) -> dict[str, Any] | None:
+    """The holder on another host that this host's lock, free as it is, may not know of."""
+    holder = _read(note)
+    if not holder or holder["host"] == socket.gethostname():
+        return None
+    try:
+        # Both times are the file system's own: the clocks of two hosts may differ.
+        os.utime(file)
+        silent = file.stat().st_mtime - note.stat().st_mtime
+    except FileNotFoundError:
+        return None
+    return holder | {"silent": silent} if silent < _SILENT_SECONDS else None
+
+
+def _who(file: Path, holder: dict[str, Any]) -> str:
+    folder = file.parent
+    if not holder:
+        return f"{folder} is in use by another process; wait until it ends, or choose another folder"
+    host = holder["host"]
+    place = f"this host, {host}," if host == socket.gethostname() else host
+    words = f"{folder} is in use by process {holder['process']} on {place} since {holder['since']}"
+    if "silent" in holder:
+        return (
+            f"{words}; its last sign of life was {max(0.0, holder['silent']):.0f} s ago. If it was killed, "
+            f"try again in {_SILENT_SECONDS:.0f} s; if not, wait until it ends, or choose another folder"
+        )
+    return f"{words}; wait until it ends, or choose another folder"
+
+
+def _show_life(notes: list[Path], ended: threading.Event) -> None:
+    while not ended.wait(_SIGN_SECONDS):
+        for note in notes:
+            with suppress(OSError):
+                os.utime(note)
