@@ -89,9 +89,9 @@ def test_error_of_a_library_that_writes_is_about_the_file_asked_for(tmp_path):
         beside.write_bytes(b"half")
         raise OSError("Error writing bytes to file: [Errno 28] No space left on device")
 
-    with pytest.raises(OutputError, match=r"table\.parquet could not be written: .*space"):
-        with whole_file(path) as beside:
-            fail(beside)
+    words = r"table\.parquet could not be written: .*space"
+    with pytest.raises(OutputError, match=words), whole_file(path) as beside:
+        fail(beside)
     assert list(tmp_path.iterdir()) == []
 
 
