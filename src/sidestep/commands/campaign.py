@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._program import command as command_line
 from sidestep.commands.common import CampaignBar, going_on, stood_still, write_json_file
 
 if TYPE_CHECKING:
