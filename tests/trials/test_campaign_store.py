@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from sidestep.store.damage import DamageWarning
+from sidestep.store.files import OutputError
 from sidestep.trials.campaign import Job, Store, campaign_rows
 from sidestep.trials.campaign import store as store_module
 from sidestep.trials.campaign.jobs import record_of
@@ -101,7 +102,7 @@ def test_full_disk_is_an_error_and_no_result(store, monkeypatch):
         raise OSError(errno.ENOSPC, "full")
 
     monkeypatch.setattr(os, "link", refuse)
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(OutputError, match="could not be written: full"):
         store.keep(record(JOBS[0]))
     assert store.read(JOBS[0].id) is None
 

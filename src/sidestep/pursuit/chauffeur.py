@@ -46,6 +46,7 @@ class Chauffeur(Pursuer):
     """
 
     takes_lanes = True
+    always_finite = True
 
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         speed, axle, period = scenario.pursuer_speed, scenario.pursuer_half_axle, scenario.control_period

@@ -190,6 +190,8 @@ class Interceptor(Pursuer):
 class Random(Pursuer):
     """Wheel speeds drawn uniformly from [-V, V], independently at each control period."""
 
+    always_finite = True
+
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         speed = scenario.pursuer_speed
         return speed * jax.random.uniform(key, (2,), dtype=speed.dtype, minval=-1.0, maxval=1.0)

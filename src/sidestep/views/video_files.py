@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sidestep._packages import install_extra, needed
-from sidestep.store.files import whole_file
+from sidestep.store.files import OutputError, whole_file
 from sidestep.store.outputs import try_outputs
 
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
@@ -33,17 +33,17 @@ class VideoError(ValueError):
 def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
     """The path, if a video can be written there: asked before any work is done.
 
-    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, and when the package that writes it
-    is not installed; `OutputError` for a folder or a place that cannot be written to, and for a file that
-    exists unless `overwrite`.
+    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot
+    be written to, for a file that exists unless `overwrite`, and when the package that writes it is not
+    installed.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise VideoError(f"{path} must end in one of {', '.join(SUFFIXES)}: it says what to write")
-    if overwrite:
-        try_outputs(files=[path])
-    else:
-        try_outputs(new=[path])
+    try:
+        try_outputs(files=[path] if overwrite else [], new=[] if overwrite else [path])
+    except OutputError as error:
+        raise VideoError(str(error)) from error
     if path.suffix.lower() == ".mp4":
         load_av()
     else:

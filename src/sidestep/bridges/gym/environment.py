@@ -49,7 +49,8 @@ class PursuedEnv(gymnasium.Env):
     - `info` has `cost` (1.0 for a capture or collision), the flags `captured`, `collided`, `reached` and
       `timed_out`, the shield's worst `status` of the step and its mean `intervention` (m/s), the action
       `proposed` and the mean one `executed`, the least `pursuer_clearance` and `obstacle_clearance` (m), and
-      the control `periods` lived through.
+      the control `periods` lived through, and `pursuer_invalid`, those of them in which a pursuer's wheel
+      speeds were not finite and it stood still.
     - `reset(seed=s)` begins episode 0 of `sidestep.evaluate(..., key=s)`, each further `reset()` the next.
       `reset(options={"world": ...})` starts in a given `World`, or in a mapping of its parts.
     """
