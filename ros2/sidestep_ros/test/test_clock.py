@@ -29,7 +29,7 @@ class Chase(Robots):
         super().__init__()
         self.poses["obstacle"] = [0.0, 5.0, 0.0]
         self.nominal = (0.0, 0.0)
-        self._clock = self.create_publisher(Clock, "/clock", 10) if time is not None else None
+        self._time_publisher = self.create_publisher(Clock, "/clock", 10) if time is not None else None
 
     def stamp(self, ahead=0.0):
         if self.time is None:
@@ -39,11 +39,11 @@ class Chase(Robots):
         return Time(sec=seconds, nanosec=rest)
 
     def _tick(self):
-        if self._clock is not None:
+        if self._time_publisher is not None:
             ahead, self.set_by = self.set_by, 0.0
             self.time += self.period + ahead
             seconds, rest = divmod(round(self.time * NANOSECONDS), NANOSECONDS)
-            self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
+            self._time_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
         super()._tick()
         if self.going:
             self._drive()
@@ -129,7 +129,7 @@ def test_a_clock_that_is_set_back_by_a_time_server_while_a_log_is_written(middle
         # Now and stamps alike are minutes earlier, before the node began.
         node.times._epoch += 600 * NANOSECONDS
         check_that_it_went_on(robots, begin, report, "wall clock set back by 10 minutes")
-        node.leave_safe()
+    node._log.close()
     assert rclpy.ok()
     found = load_log(log)
     assert found.complete
