@@ -14,6 +14,8 @@ from sidestep_ros.recorder import values_of
 from sidestep_ros.shield_node import ShieldNode
 
 CAPTURE = 0.15
+# However busy the machine, poses are no reason to stop here.
+PATIENT = ("stale_after:=1.0", "nominal_timeout:=2.0")
 OVERRIDES = f"scenario_overrides:=[capture_distance={CAPTURE}]"
 
 
@@ -27,7 +29,7 @@ class Chase(Robots):
         super().__init__()
         self.poses["obstacle"] = [0.0, 5.0, 0.0]
         self.nominal = (0.0, 0.0)
-        self._clock = self.create_publisher(Clock, "/clock", 10) if time is not None else None
+        self._time_publisher = self.create_publisher(Clock, "/clock", 10) if time is not None else None
 
     def stamp(self, ahead=0.0):
         if self.time is None:
@@ -37,11 +39,11 @@ class Chase(Robots):
         return Time(sec=seconds, nanosec=rest)
 
     def _tick(self):
-        if self._clock is not None:
+        if self._time_publisher is not None:
             ahead, self.set_by = self.set_by, 0.0
             self.time += self.period + ahead
             seconds, rest = divmod(round(self.time * NANOSECONDS), NANOSECONDS)
-            self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
+            self._time_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
         super()._tick()
         if self.going:
             self._drive()
@@ -81,10 +83,10 @@ def check_that_it_went_on(robots, begin, report, what):
     wait_until(lambda: robots.least < 0.3, "the pursuer")
     count = len(robots.decided)
     wait_until(lambda: len(robots.decided) > count + 40, "two seconds more")
-    stops = [index - first for index, (level, _) in enumerate(robots.decided) if level == "stop"]
+    stops = [index for index, (level, _) in enumerate(robots.decided[first:]) if level == "stop"]
     report(f"{what}: stops at decisions {stops} from then, least distance {1e3 * robots.least:.0f} mm")
-    # A busy machine may be late with poses at any time; what must not be is a stop that lasts.
-    assert len([index for index in stops if 0 <= index < 40]) <= 8
+    assert stops[0] == 0
+    assert len(stops) <= 4
     assert robots.least > CAPTURE
 
 
@@ -92,7 +94,12 @@ def test_a_simulated_clock_that_begins_anew_as_when_a_bag_loops(middleware, star
     robots = Chase(time=100.0)
     with Spinner(robots):
         node = start(
-            "shield_node", "shield:=game", "diagnostics_period:=0.0", "use_sim_time:=true", OVERRIDES
+            "shield_node",
+            "shield:=game",
+            "diagnostics_period:=0.0",
+            "use_sim_time:=true",
+            OVERRIDES,
+            *PATIENT,
         )
         node.wait_ready()
         wait_until(lambda: is_normal(robots), "a normal decision")
@@ -111,7 +118,7 @@ def test_a_clock_that_is_set_back_by_a_time_server_while_a_log_is_written(middle
     from sidestep.bridges.logs import load_log
 
     log = tmp_path / "drive.mcap"
-    given = {"shield": "game", "diagnostics_period": 0.0, "log": str(log)}
+    given = {"shield": "game", "diagnostics_period": 0.0, "log": str(log), "stale_after": 1.0}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     overrides.append(Parameter("scenario_overrides", value=[f"capture_distance={CAPTURE}"]))
     node, robots = ShieldNode(parameter_overrides=overrides), Chase()
@@ -122,7 +129,7 @@ def test_a_clock_that_is_set_back_by_a_time_server_while_a_log_is_written(middle
         # Now and stamps alike are minutes earlier, before the node began.
         node.times._epoch += 600 * NANOSECONDS
         check_that_it_went_on(robots, begin, report, "wall clock set back by 10 minutes")
-        node.leave_safe()
+    node._log.close()
     assert rclpy.ok()
     found = load_log(log)
     assert found.complete
