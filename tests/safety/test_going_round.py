@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sidestep.safety import GameShield, Status, filter_in_lanes, make_shield, tolerance
-from sidestep.safety.shields import GameMemory
 from sidestep.world import World, load_scenario
 
 SECONDS = 30.0
@@ -126,14 +125,14 @@ def crowd(scenario):
 def test_going_round_violates_no_row_that_can_be_kept(scenario, crowd):
     worlds, nominal = crowd
     game, plain = make_shield("game", scenario), GameShield(scenario)
-    sides = jax.vmap(plain.init)(worlds)
+    sides, begun = jax.vmap(plain.init)(worlds), jax.vmap(game.init)(worlds)
     limit = float(scenario.evader_speed)
     allowed = tolerance(nominal.dtype) * limit
     ask = eqx.filter_jit(lambda shield, memory: jax.vmap(shield)(worlds, nominal, memory))
     expected, _ = ask(plain, sides)
     changed = 0
     for turn in (-1.0, 0.0, 1.0):
-        memory = GameMemory(sides, jnp.full(len(nominal), turn, nominal.dtype))
+        memory = eqx.tree_at(lambda m: m.turn, begun, jnp.full_like(begun.turn, turn))
         result, after = ask(game, memory)
         infeasible = np.asarray(expected.status) == Status.INFEASIBLE
         np.testing.assert_array_equal(np.asarray(result.status) == Status.INFEASIBLE, infeasible)
@@ -161,7 +160,7 @@ def test_input_that_is_not_finite_ends_the_way_round(scenario):
         (world, [jnp.nan, 0.0]),
         (eqx.tree_at(lambda w: w.obstacles, world, world.obstacles.at[0, 0].set(jnp.nan)), [-0.1, 0.0]),
     ):
-        result, after = game(broken, jnp.asarray(nominal), memory)
+        result, after = eqx.filter_jit(game.__call__)(broken, jnp.asarray(nominal), memory)
         assert result.status == Status.INVALID
         assert np.all(np.isfinite(result.action))
         assert after.turn == 0.0

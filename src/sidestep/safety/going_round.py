@@ -30,6 +30,9 @@ PRESSING = 0.5
 LEADS_ON = 0.3
 """Share of v_e at which the nominal action itself slides along the obstacle, so that it is turned no more."""
 
+NEAR_PURSUER = 0.5
+"""Pursuit barrier (m) below which the nominal action is not turned."""
+
 
 class _Obstacles(NamedTuple):
     """Of each obstacle: whether its row keeps the nominal action out, whether that presses on, how fast
@@ -80,16 +83,19 @@ def next_turn(
     nominal: Float[AnyArray, "2 *lanes"],
     action: Float[AnyArray, "2 *lanes"],
     turn: Float[AnyArray, "*lanes"],
+    barriers: Float[AnyArray, "m *lanes"],
 ) -> Lanes:
     """What to remember once `action` (m/s) has been chosen for the `nominal` one as the policy gave it.
 
     Stuck means: an obstacle's row keeps out a nominal action that presses on, and the action hardly moves
     relative to that obstacle. The side is the one that the nominal action slides to, the left where it slides
-    to neither. Where the evader is stuck on its way round too, it turns to the other side.
+    to neither. Where the evader is stuck on its way round too, it turns to the other side. `barriers` (m) are
+    those towards the pursuers, -inf where the world was not finite.
     """
     told, limit = _obstacles(scenario, world, nominal), scenario.evader_speed
     slow = length(action[0] - world.obstacles[:, 2], action[1] - world.obstacles[:, 3]) < STUCK * limit
     stuck = fold(jnp.logical_or, told.hinders & told.pressing & slow, False)
     slides = fold(jnp.add, jnp.where(told.hinders, told.slides, 0.0), 0.0)
     chosen = jnp.where(turn == 0.0, jnp.where(slides > 0.0, -1.0, 1.0), -turn)
-    return jnp.where(stuck, chosen, turn).astype(turn.dtype)
+    far = fold(jnp.minimum, jnp.asarray(barriers), jnp.inf) >= NEAR_PURSUER
+    return jnp.where(far, jnp.where(stuck, chosen, turn), 0.0).astype(turn.dtype)

@@ -157,7 +157,9 @@ class JointShield(Shield):
         result, after, accepted = self._filtered(world, nominal, turn, memory)
         # What the look-ahead avoids is not what it is stuck behind.
         moved_on = ~accepted | (result.status == Status.INVALID)
-        turn = jnp.where(moved_on, 0.0, next_turn(kept, world, nominal, result.action, turn))
+        towards_pursuers = result.barriers[: self.scenario.pursuer_count]
+        turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
+        turn = jnp.where(moved_on, 0.0, turn)
         return result, eqx.tree_at(lambda memory: memory.turn, after, turn.astype(memory.turn.dtype))
 
     def _filtered(

@@ -307,9 +307,9 @@ class GameShield(Shield):
         turn = still_turned(kept, world, nominal, memory.turn)
         result, sides = self._filtered(world, turned(nominal, turn), memory.sides)
         result = as_turned(result, nominal, turn)
-        turn = jnp.where(
-            result.status == Status.INVALID, 0.0, next_turn(kept, world, nominal, result.action, turn)
-        )
+        towards_pursuers = result.barriers[: self.scenario.pursuer_count]
+        turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
+        turn = jnp.where(result.status == Status.INVALID, 0.0, turn)
         return result, GameMemory(sides, turn.astype(memory.turn.dtype))
 
     def _filtered(
