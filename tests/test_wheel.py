@@ -35,8 +35,9 @@ COMMANDS = {
 FILES = {
     "grid.toml": 'kind = "evaluate"\n[grid]\nseed = [0]\nshield = ["none"]\n[settings]\nepisodes = 1\n',
     "step.py": (
+        "import sidestep.bridges.gym\n"
         "import gymnasium\n"
-        "env = gymnasium.make('sidestep.bridges.gym:sidestep/Pursued-v0', shield='none')\n"
+        "env = gymnasium.make('sidestep/Pursued-v0', shield='none')\n"
         "env.reset(seed=0)\n"
         "print(env.step(env.action_space.sample())[1])\n"
     ),
@@ -79,7 +80,7 @@ class Place:
             env=self.environment,
             capture_output=True,
             text=True,
-            timeout=600,
+            timeout=900,
         )
 
     def ok(self, line):
