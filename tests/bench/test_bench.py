@@ -84,6 +84,9 @@ def test_exponents_are_the_slopes_of_power_laws():
     fixed_cost = [1.0 if n < 8 else n / 8 for n in sizes]
     assert timing.tail_exponent(sizes, fixed_cost) == pytest.approx(1.0)
     assert timing.tail_exponent([0, 1], [1.0, 1.0]) is None
+    # A factor of two is no growth to speak of.
+    assert timing.tail_exponent([1, 2, 3, 4], [1.0, 2.0, 3.0, 4.0]) is None
+    assert timing.tail_exponent([1, 4, 16], [1.0, 4.0, 16.0]) == pytest.approx(1.0)
     with pytest.raises(ValueError, match="two or more"):
         timing.exponent([1], [1.0])
 

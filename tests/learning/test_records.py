@@ -15,10 +15,12 @@ from sidestep.learning.records import (
     append_metrics,
     converged_episode,
     create_run,
+    longest_convergence,
     moving_mean,
     open_run,
     read_metrics,
     read_summary,
+    stays_converged_from,
     summarise,
     truncate_metrics,
     write_summary,
@@ -246,3 +248,16 @@ def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
     assert summarise([*older, episode(2)], wall_seconds=0.0, **about)["invalid_rate"] is None
     with pytest.raises(RunError, match="crashed"):
         summarise([episode(1, "crashed")], wall_seconds=0.0, **about)
+
+
+def test_first_crossing_that_does_not_last_is_told_from_one_that_does():
+    returns = [998.0] * 60 + [-10.0] * 3 + [998.0] * 40
+    assert converged_episode(returns) == 20
+    assert longest_convergence(returns) == (20, 61)
+    assert stays_converged_from(returns) == 82
+    assert stays_converged_from([998.0] * 40) == 20
+    assert stays_converged_from([998.0] * 40 + [-10.0] * 5) is None
+    assert longest_convergence([998.0] * 40 + [-10.0] * 5) == (20, 41)
+    assert longest_convergence([-10.0] * 50) is None
+    assert longest_convergence([]) is None
+    assert stays_converged_from([]) is None

@@ -37,6 +37,8 @@ TRAINING = {
     "captured": 1,
     "collided": 0,
     "converged_episode": None,
+    "converged_stays_from": None,
+    "converged_longest": [102, 200],
     "final_return": -123.4,
     **INTERFERENCE,
 }
@@ -87,7 +89,9 @@ def test_every_cell_is_under_its_own_shield(summary):
         summary["shields"][shield]["training"]["converged_episode"] = 20 + episode
     training, *_, scene, untrained_scene = comparison_sections(json.loads(json.dumps(summary)))
     assert training.columns == ("reported", *SHIELDS)
-    assert dict(training.rows)["converged by episode"] == ("80", "20", "21", "22", "23")
+    assert dict(training.rows)["first converged at"] == ("80", "20", "21", "22", "23")
+    assert dict(training.rows)["  stays so from"] == ("-", *["never"] * 4)
+    assert dict(training.rows)["  longest stay"] == ("-", *["102-200"] * 4)
     assert dict(scene.rows)["outcome"] == ("reached", *["timed out"] * 4)
     assert dict(untrained_scene.rows)["outcome"] == ("-", *["reached"] * 4)
     assert dict(scene.rows)["closest to collision, m"] == ("-",) * 5
@@ -97,6 +101,13 @@ def test_figure_that_is_missing_in_a_summary_is_not_passed_over(summary):
     del summary["shields"]["none"]["training"]["mean_correction"]
     with pytest.raises(KeyError, match="mean_correction"):
         comparison_sections(summary)
+
+
+def test_summary_from_before_stays_were_kept_is_shown_without_them(summary):
+    for study in summary["shields"].values():
+        del study["training"]["converged_stays_from"], study["training"]["converged_longest"]
+    training = dict(comparison_sections(json.loads(json.dumps(summary)))[0].rows)
+    assert training["  stays so from"] == training["  longest stay"] == ("-",) * 5
 
 
 def test_markdown_has_a_table_for_each_section(summary):

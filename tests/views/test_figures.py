@@ -27,7 +27,6 @@ from sidestep.views.style import (
     shield_dashes,
     shield_words,
 )
-from sidestep.views.training_figures import shows_episodes
 from sidestep.world import Scenario
 from sidestep.world.capture_geometry import capture_set_distance
 
@@ -99,14 +98,6 @@ def test_each_shield_keeps_its_colour_whichever_others_are_shown(tmp_path, run_o
         lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
         for shield in shields:
             assert lines[shield_words(shield)].get_color() == shield_colour(shield)
-
-
-def test_returns_of_many_shields_do_not_cover_each_other(tmp_path, run_of, monkeypatch):
-    for shields, dots in ((("none", "joint"), 2), (SHIELDS, 0)):
-        runs = [run_of(shield) for shield in shields]
-        assert shows_episodes(runs) == bool(dots)
-        figure = drawn(monkeypatch, "training_figures", lambda runs=runs: reward_figure(runs, tmp_path / "x"))
-        assert len(figure.axes[0].collections) == dots
 
 
 def test_safety_table_counts_what_the_metrics_say(tmp_path, run_of):

@@ -259,3 +259,30 @@ def test_after_a_rest_pictures_go_on(page):
     )
     assert during >= 60.0
     assert after >= 20
+
+
+def test_words_under_a_shield_follow_what_the_numbers_allow(page, address):
+    words = page.locator("#shield-words")
+    page.goto(address + "#shield=game&pursuer_speed=0.26")
+    page.reload()
+    expect(words).to_contain_text("the best pursuer wins", timeout=WAIT)
+    expect(words).not_to_contain_text("nobody should catch it")
+    page.locator("#defaults").click()
+    expect(words).to_contain_text("the robot wins the game", timeout=WAIT)
+
+
+@pytest.mark.parametrize(
+    "page", [{}, {"viewport": {"width": 390, "height": 844}}], indirect=True, ids=["wide", "phone"]
+)
+def test_warming_up_covers_no_robot(page, address):
+    page.goto(address + AHEAD)
+    page.reload()
+    ready(page)
+    page.locator("#scene").focus()
+    page.keyboard.press("Space")
+    page.evaluate("document.getElementById('warming').hidden = false")
+    page.wait_for_timeout(6000)
+    bottom = page.evaluate("document.getElementById('warming').getBoundingClientRect().bottom")
+    x, y = page.evaluate("JSON.parse(document.getElementById('scene').dataset.evader)")
+    assert y > bottom
+    assert page.evaluate("document.getElementById('warming').getBoundingClientRect().height") < 170

@@ -129,3 +129,17 @@ def test_the_page_fits_and_the_scene_is_painted(page):
     ink = page.evaluate("getComputedStyle(document.querySelector('.told')).color")
     dark = width < 1000
     assert (int(ink.removeprefix("rgb(").split(",")[0]) > 128) == dark
+
+
+@pytest.mark.parametrize("page", [{"viewport": {"width": 390, "height": 844}}], indirect=True)
+def test_no_column_of_a_table_is_out_of_view_on_a_phone(page):
+    boxes = page.evaluate(
+        "[...document.querySelectorAll('.scroll')].map((e) => [e.scrollWidth, e.clientWidth])"
+    )
+    assert boxes
+    assert all(needed <= there for needed, there in boxes)
+    right = page.evaluate(
+        "Math.max(...[...document.querySelectorAll('.scroll td, .scroll th')]"
+        ".map((e) => e.getBoundingClientRect().right))"
+    )
+    assert right <= 390

@@ -107,7 +107,7 @@ def comparison(
         else None
         for group, periods in zip(groups.values(), steps, strict=True)
     ]
-    add("mean correction", "–", [shown_number(value, 4, " m/s") for value in corrections])
+    add("mean correction, m/s", "–", [shown_number(value, 4) for value in corrections])
     closest = [min(_pooled(group, "min_pursuer_clearance"), default=None) for group in groups.values()]
     add("closest to capture", "–", [shown_number(value, 4, " m") for value in closest])
     for policy, found, reported in (

@@ -119,7 +119,7 @@ export class Scene {
     this.target(places.target, view.reach, colours, now);
     for (const pose of places.pursuers) {
       const at = camera.px(pose[0], pose[1]);
-      if (show.capture) this.sets(at, pose[2], numbers, places.evader, colours);
+      if (show.capture) this.sets(at, pose[2], numbers, places.evader, view.free, colours);
       else this.disc(at, numbers.capture_distance * scale, colours.pursuerFaint, colours.pursuer);
     }
     const evader = camera.px(...places.evader);
@@ -150,11 +150,7 @@ export class Scene {
     for (let k = Math.ceil(y0 / step); k * step <= y1; k++) this.line(x0, k * step, x1, k * step, k * step, colours);
     const [left, top] = camera.px(-arena / 2, arena / 2);
     const side = arena * camera.scale;
-    // Only where nothing is written.
-    pen.save();
-    pen.beginPath();
-    pen.rect(free.left, free.top, free.width, free.height);
-    pen.clip();
+    this.clip(free);
     pen.strokeStyle = colours.arena;
     pen.lineWidth = 1.5;
     pen.setLineDash([2, 7]);
@@ -163,6 +159,14 @@ export class Scene {
     pen.roundRect(left, top, side, side, 14);
     pen.stroke();
     pen.restore();
+  }
+
+  // Long lines run only where nothing is written; `pen.restore()` ends it.
+  clip(free) {
+    this.pen.save();
+    this.pen.beginPath();
+    this.pen.rect(free.left, free.top, free.width, free.height);
+    this.pen.clip();
   }
 
   line(xa, ya, xb, yb, at, colours) {
@@ -211,7 +215,7 @@ export class Scene {
     pen.restore();
   }
 
-  sets(at, heading, numbers, evader, colours) {
+  sets(at, heading, numbers, evader, free, colours) {
     const { pen, camera } = this;
     const [l, rho] = captureSet(numbers);
     const [ex, ey] = camera.px(...evader);
@@ -221,6 +225,7 @@ export class Scene {
     bearing = Math.min(bearing, Math.PI - bearing);
     const level = distance * Math.cos(Math.max(usable - bearing, 0));
     if (level > l + 0.004 && level < l + 0.9) {
+      this.clip(free);
       this.hull(at, heading, level, rho);
       pen.globalAlpha = Math.max(0.15, 1 - (level - l) / 0.9);
       pen.strokeStyle = colours.level;
@@ -228,9 +233,7 @@ export class Scene {
       pen.setLineDash([1, 5]);
       pen.lineCap = "round";
       pen.stroke();
-      pen.lineCap = "butt";
-      pen.setLineDash([]);
-      pen.globalAlpha = 1;
+      pen.restore();
     }
     this.hull(at, heading, l, rho);
     pen.fillStyle = colours.pursuerFaint;
