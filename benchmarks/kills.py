@@ -115,14 +115,40 @@ class Child:
         self.process.wait()
 
 
-def begun(out: Path) -> bool:
-    """Whether anything has been measured yet."""
-    return any(out.rglob("metrics.jsonl"))
+def measured(out: Path) -> int:
+    """Bytes of what has been measured so far."""
+    return sum(path.stat().st_size for path in out.rglob("metrics.jsonl"))
 
 
 def writes(out: Path) -> set[Path]:
     """The files that are being written, or were when a kill came."""
     return set(out.rglob(".*.tmp"))
+
+
+def wait(child: Child, out: Path, sort: str | None, first: float, work: float, chance: random.Random) -> None:
+    """Wait for a random moment of this sort, for the end without one; ends when the child does.
+
+    **Arguments:** `first` seconds from the start to the first measurement, `work` from there to the end.
+    """
+    begun, left, before = time.monotonic(), writes(out), measured(out)
+    if sort == "starting":
+        until = begun + chance.uniform(0.0, first)
+        while not child.ended() and time.monotonic() < until:
+            time.sleep(0.002)
+    elif sort == "working":
+        while not child.ended() and measured(out) <= before:
+            time.sleep(0.002)
+        until = time.monotonic() + chance.uniform(0.0, work)
+        while not child.ended() and time.monotonic() < until:
+            time.sleep(0.002)
+    elif sort == "writing":
+        seen, wanted = left, len(left) + chance.randint(1, 4)
+        while not child.ended() and len(seen) < wanted:
+            # Names repeat: one file is written again and again.
+            seen = seen | {path.with_name(f"{path.name}{measured(out)}") for path in writes(out) - left}
+            time.sleep(0.0005)
+    else:
+        child.process.wait()
 
 
 def contents(out: Path) -> dict[str, Any]:
@@ -178,43 +204,38 @@ def study(
 
     started, first = time.monotonic(), None
     child = Child(words(command, work / "undisturbed", work, episodes), log)
-    while not child.ended():
-        if first is None and begun(work / "undisturbed"):
-            first = time.monotonic() - started
-        time.sleep(0.01)
-    total = time.monotonic() - started
-    first = total if first is None else first
-    if problems := failed(child):
-        return {}, 0, problems
-    undisturbed = contents(work / "undisturbed")
+    try:
+        while not child.ended():
+            if first is None and measured(work / "undisturbed"):
+                first = time.monotonic() - started
+            time.sleep(0.01)
+        total = time.monotonic() - started
+        first = total if first is None else first
+        if problems := failed(child):
+            return {}, 0, problems
+        undisturbed = contents(work / "undisturbed")
 
-    counts = {"starting": 0, "working": 0, "writing": 0}
-    runs, done = 1, 0
-    out = work / f"killed{runs}"
-    while True:
-        left = writes(out)
-        child = Child(words(command, out, work, episodes), log)
-        sort = chance.choice(list(counts)) if done < kills else None
-        waited = (
-            chance.uniform(0.0, first) if sort == "starting" else first + chance.uniform(0.0, total - first)
-        )
-        deadline = time.monotonic() + (waited if sort != "writing" else chance.uniform(0.0, waited))
-        while not child.ended() and (sort is None or time.monotonic() < deadline):
-            time.sleep(0.002)
-        while sort == "writing" and not child.ended() and writes(out) <= left:
-            time.sleep(0.0005)
-        if sort is not None and not child.ended():
-            # Workers die with the command, or are left behind by it.
-            child.kill(group=chance.random() < 0.5)
-            done, counts[sort] = done + 1, counts[sort] + 1
-            print(f"\r{done} of {kills} kills, run {runs}", end="", file=sys.stderr)
-            continue
-        wrong = failed(child) or differing(undisturbed, contents(out))
-        if wrong or done >= kills:
-            print(file=sys.stderr)
-            return counts, runs, wrong
-        runs += 1
-        out = work / f"killed{runs}"
+        counts = {"starting": 0, "working": 0, "writing": 0}
+        runs, done = 1, 0
+        while True:
+            out = work / f"killed{runs}"
+            child = Child(words(command, out, work, episodes), log)
+            sort = chance.choice(list(counts)) if done < kills else None
+            wait(child, out, sort, first, total - first, chance)
+            if sort is not None and not child.ended():
+                # Workers die with the command, or are left behind by it.
+                child.kill(group=chance.random() < 0.5)
+                done, counts[sort] = done + 1, counts[sort] + 1
+                print(f"\r{done} of {kills} kills, run {runs}", end="", file=sys.stderr)
+                continue
+            wrong = failed(child) or differing(undisturbed, contents(out))
+            if wrong or done >= kills:
+                print(file=sys.stderr)
+                return counts, runs, wrong
+            runs += 1
+    finally:
+        if not child.ended():
+            child.kill(group=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
