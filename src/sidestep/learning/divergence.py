@@ -24,6 +24,7 @@ _PARTS = {
     "critic_moments": "Adam moments of the critics",
 }
 
+_USUAL_RATE = 3e-4
 _USUAL_SCALE = 0.01
 
 
@@ -46,7 +47,8 @@ class Diverged(ValueError):
                 options.reward_scale,
             )
         )
-        smaller = f"actor_learning_rate={actor / 10.0:g} critic_learning_rate={critic / 10.0:g}"
+        rates = [min(rate / 10.0, _USUAL_RATE) for rate in (actor, critic)]
+        smaller = f"actor_learning_rate={rates[0]:g} critic_learning_rate={rates[1]:g}"
         if scale > _USUAL_SCALE:
             smaller += f" reward_scale={_USUAL_SCALE:g}"
         kept = ""
