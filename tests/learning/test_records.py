@@ -15,6 +15,7 @@ from sidestep.learning.records import (
     append_metrics,
     converged_episode,
     create_run,
+    json_safe,
     longest_convergence,
     moving_mean,
     open_run,

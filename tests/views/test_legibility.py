@@ -3,6 +3,7 @@ that says safe where nothing is."""
 
 import dataclasses
 import itertools
+import sys
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from sidestep.views.intervention_figure import _share_colours
 from sidestep.views.labels import Label, place_labels
 from sidestep.views.replay import _capture_set
 from sidestep.views.scene import CAPTURE_SET_LOOK, capture_set_outline, correction_colours
+from sidestep.views.style import new_figure
 from sidestep.world import Scenario, load_scenario
 
 PAPER = Scenario()
@@ -36,8 +38,9 @@ def drawn(monkeypatch, tmp_path):
 
     def drawn(module, draw):
         figures = []
-        place = f"sidestep.views.{module}.save"
-        monkeypatch.setattr(place, lambda figure, path: (figures.append(figure), (path, path))[1])
+        # By its name the package gives the function of the same name, not the module.
+        module = sys.modules[f"sidestep.views.{module}"]
+        monkeypatch.setattr(module, "save", lambda figure, path: (figures.append(figure), (path, path))[1])
         draw(tmp_path / "x")
         place_labels(figures[0])
         return figures[0]
@@ -112,8 +115,8 @@ def test_contrast_is_that_of_the_standard():
     assert contrast("#777777", "white") == pytest.approx(4.48, abs=0.01)
 
 
-@pytest.mark.parametrize("shields", [("none", "paper", "game", "joint"), ("joint",)], ids=len)
-def test_time_labels_of_a_path_that_circles_do_not_cover_each_other(drawn, circling, shields):
+def test_time_labels_of_a_path_that_circles_do_not_cover_each_other(drawn, circling):
+    shields = ("none", "paper", "game", "joint")
     figure = drawn(
         "trajectory_figures", lambda path: scenes_figure(PAPER, dict.fromkeys(shields, circling), path)
     )
@@ -127,14 +130,14 @@ def test_labels_of_a_twin_figure_do_not_cover_each_other(drawn, circling, chase)
     assert_legible(figure)
 
 
-def test_a_label_that_finds_no_room_is_left_out(drawn, chase):
-    figure = drawn("trajectory_figures", lambda path: trajectory_figure(PAPER, chase(), path, shield="game"))
-    axes = figure.axes[0]
-    for _ in range(30):
-        axes.add_artist(Label("one more", (0.0, 0.0), [(0.0, 9.0), (0.0, -9.0)], rank=9))
+def test_a_label_that_finds_no_room_is_left_out():
+    figure = new_figure(3.0, 2.0)
+    axes = figure.add_subplot()
+    labels = [Label(str(rank), (0.5, 0.5), [(0.0, 15.0), (0.0, -15.0)], rank=rank) for rank in range(9)]
+    for label in reversed(labels):
+        axes.add_artist(label)
     place_labels(figure)
-    more = [label for label in figure.findobj(Label) if label.get_text() == "one more"]
-    assert 0 < sum(label.get_visible() for label in more) <= 2
+    assert [label.get_visible() for label in labels] == [True] * 2 + [False] * 7
 
 
 @pytest.mark.parametrize("shield", ["none", "paper", "game", "joint"])

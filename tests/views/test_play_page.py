@@ -283,6 +283,6 @@ def test_warming_up_covers_no_robot(page, address):
     page.evaluate("document.getElementById('warming').hidden = false")
     page.wait_for_timeout(6000)
     bottom = page.evaluate("document.getElementById('warming').getBoundingClientRect().bottom")
-    _, y = page.evaluate("JSON.parse(document.getElementById('scene').dataset.evader)")
+    _x, y = page.evaluate("JSON.parse(document.getElementById('scene').dataset.evader)")
     assert y > bottom
     assert page.evaluate("document.getElementById('warming').getBoundingClientRect().height") < 170

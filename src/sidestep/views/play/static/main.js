@@ -146,7 +146,10 @@ function freeRoom() {
   const foot = Math.min(...[strip, bar, words].filter((box) => box.height).map((box) => box.top));
   const low = foot - whole.top - 6;
   const warming = byId("warming").getBoundingClientRect();
-  const head = Math.max(narrow ? verdict.bottom - whole.top : below + 2, warming.height ? warming.bottom - whole.top : 0);
+  // In between, the verdict hangs at the left below the score, and robots pass beside it.
+  const beside = !narrow && verdict.top - whole.top > below;
+  const boxes = [verdict, warming].filter((box) => box.height && !(beside && box === verdict));
+  const head = Math.max(below + 2, ...boxes.map((box) => box.bottom - whole.top));
   const top = head + 8;
   state.ruler = narrow ? [16, head + 24] : [24, strip.top - whole.top - 10];
   return { left: 14, top, width: whole.width - 28, height: Math.max(low - top, 80) };
