@@ -127,7 +127,6 @@ def falsify(
     )  # fmt: skip
     check_plan(scenario, plan)
     shield_called = shield_name(shield, scenario)
-    target = Target(scenario, as_policy(policy, scenario), as_shield(shield, scenario))
     about = {
         "kind": "falsification",
         "scenario": scenario_to_dict(scenario),
@@ -136,11 +135,12 @@ def falsify(
         "version": sidestep.__version__,
         **{name: getattr(plan, name) for name in Plan.__dataclass_fields__},
     }
+    if stored is not None:
+        refuse_changes(folder, stored, about, ("scenario", "shield", *Plan.__dataclass_fields__))
+        check_policy(folder, stored["policy"], about["policy"])
+    target = Target(scenario, as_policy(policy, scenario), as_shield(shield, scenario))
     with writing(folder, resume=resume):
-        if stored is not None:
-            refuse_changes(folder, stored, about, ("scenario", "shield", *Plan.__dataclass_fields__))
-            check_policy(folder, stored["policy"], about["policy"])
-        else:
+        if stored is None:
             about["budget"] = budget_for(folder, {}, 0.0, minutes, episodes)
             create_run(folder, about)
         for name in ("counterexamples", "checkpoints", "figures"):
