@@ -15,7 +15,6 @@ from sidestep.learning.records import (
     append_metrics,
     converged_episode,
     create_run,
-    json_safe,
     longest_convergence,
     moving_mean,
     open_run,

@@ -52,7 +52,7 @@ def load_policy(run: str | Path) -> LearnedPolicy:
     """
     path = Path(run)
     if path.suffix != ".npz":
-        open_run(path, "name a run folder, or the policy.npz in it")
+        open_run(path, otherwise="name a run folder, or the policy.npz in it")
         path = path / _FILE
         if not path.is_file():
             raise RunError(f"{run} has no policy yet: its training has not ended; continue it with --resume")

@@ -133,7 +133,7 @@ def _is_left_by_a_kill(entry: Path) -> bool:
     return is_vacant(entry) or (entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp")
 
 
-def open_run(folder: str | Path, kind: str | None = None, otherwise: str = "") -> dict[str, Any]:
+def open_run(folder: str | Path, kind: str | None = None, *, otherwise: str = "") -> dict[str, Any]:
     """The configuration of an existing run.
 
     **Arguments:** `kind` what it must be: `run` (a training), `study` or `falsification`; anything if None.

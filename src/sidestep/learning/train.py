@@ -103,7 +103,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
 
     **Raises** `RunError` when `folder` holds no training.
     """
-    config = records.open_run(folder, "run", records.NOT_BEGUN)
+    config = records.open_run(folder, "run", otherwise=records.NOT_BEGUN)
     fields = dict(config["scenario"])
     # The stored fields are complete, so whichever preset they start from leaves no trace.
     return {
@@ -282,7 +282,7 @@ def _kept(folder: Path) -> str:
 
 def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
     """**Raises** `RunError` naming what differs from the run that `folder` holds."""
-    stored = records.open_run(folder, "run", records.NOT_BEGUN)
+    stored = records.open_run(folder, "run", otherwise=records.NOT_BEGUN)
     records.refuse_changes(folder, stored, config, ("scenario", "learner", "shield", "pursuer", "seed"))
     if config["episodes"] < stored["episodes"]:
         raise records.RunError(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sidestep.learning.records import RunError, open_run
+from sidestep.learning.records import NOT_BEGUN, RunError, open_run
 from sidestep.trials.falsification.tallies import Plan
 from sidestep.world import load_scenario
 
@@ -21,7 +21,7 @@ def search_settings(folder: str | Path) -> dict[str, Any]:
 
     **Raises** `RunError` when there is none.
     """
-    config = open_run(folder, "falsification")
+    config = open_run(folder, "falsification", otherwise=NOT_BEGUN)
     return {
         "scenario": load_scenario("paper", **config["scenario"]),
         "policy": config["policy"]["name"],

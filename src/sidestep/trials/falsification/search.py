@@ -116,7 +116,7 @@ def falsify(
         raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
     if episodes is not None:
         whole_number("episodes", episodes)
-    stored = open_run(folder, "falsification", NOT_BEGUN) if resume else None
+    stored = open_run(folder, "falsification", otherwise=NOT_BEGUN) if resume else None
     if stored is not None:
         plan = plan_for(stored, plan)
     plan = plan or Plan()
