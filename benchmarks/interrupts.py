@@ -52,11 +52,11 @@ class Command:
 
 
 COMMANDS = {
-    "train": Command(["train", "--out", "{out}/a run", "--shield", "game", "--episodes", "300", *SMALL]),
-    "evaluate": Command(["evaluate", "--shield", "joint", "--episodes", "100", "--json", "{out}/e.json"]),
+    "train": Command(["train", "--out", "{out}/a run", "--shield", "game", "--episodes", "100", *SMALL]),
+    "evaluate": Command(["evaluate", "--shield", "joint", "--episodes", "32", "--json", "{out}/e.json"]),
     "reproduce": Command(
-        ["reproduce", "--out", "{out}/a study", "--shields", "none", "game", "--episodes", "20",
-         "--evaluation-episodes", "50", *SMALL]
+        ["reproduce", "--out", "{out}/a study", "--shields", "none", "game", "--episodes", "8",
+         "--evaluation-episodes", "32", *SMALL]
     ),
     "falsify": Command(
         ["falsify", "--out", "{out}/a search", "--shield", "game", "--episodes", "64", "--batch", "16",
