@@ -252,8 +252,12 @@ def test_damaged_checkpoint_is_named_on_the_error_stream_and_the_run_ends_the_sa
     newest.write_bytes(newest.read_bytes()[:-200])
     assert main(["train", "--out", str(tmp_path / "run"), "--resume"]) == 0
     shown = capsys.readouterr().err
-    assert re.search(
-        rf"sidestep: warning: {newest} is damaged.*goes on from .*, after episode 0. Lost: the 40", shown
+    found = re.search(
+        rf"sidestep: warning: {newest} is damaged.*goes on from .*, after episode (\d+). Lost: the (\d+)",
+        shown,
     )
+    # How many checkpoints there are depends on how fast the machine is.
+    assert found is not None
+    assert int(found[1]) + int(found[2]) == 40
     metrics = (folder / "metrics.jsonl" for folder in (tmp_path / "run", whole / "train"))
     assert len({path.read_bytes() for path in metrics}) == 1

@@ -85,6 +85,7 @@ def run(command: Fly, console: Console) -> int:
     """Run `sidestep fly`; returns the exit status."""
     from sidestep.store.lock import hold
 
+    check_amounts(command)
     with nullcontext() if command.out is None else hold(command.out):
         return _run(command, console)
 
@@ -93,7 +94,6 @@ def _run(command: Fly, console: Console) -> int:
     from sidestep.bridges.flight import ROOM_SENSORS, FlightOptions, Pilot, certificate_of, fly, write_video
     from sidestep.bridges.twin import changed_sensors
 
-    check_amounts(command)
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     options = FlightOptions(
         sensors=changed_sensors(ROOM_SENSORS, parse_overrides(command.noise)),

@@ -89,6 +89,7 @@ def run(command: Twin, console: Console) -> int:
     """Run `sidestep twin`; returns the exit status."""
     from sidestep.store.lock import hold
 
+    check_amounts(command)
     with nullcontext() if command.out is None else hold(command.out):
         return _run(command, console)
 
@@ -100,7 +101,6 @@ def _run(command: Twin, console: Console) -> int:
     from sidestep.bridges.twin import TwinOptions, make_sensors, settings_for, twin_episode, write_video
     from sidestep.safety import Budget
 
-    check_amounts(command)
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     scenario.check_built_in("the twin", "`sidestep fly` flies a quadrotor")
     options = TwinOptions(
