@@ -373,7 +373,7 @@ def test_existing_run_or_folder_is_never_overwritten(small, whole, tmp_path):
     with pytest.raises(RunError, match="--out"):
         small.train(out=tmp_path)
     assert contents(tmp_path) == {"checkpoints/mine.npz": b"not yours"}
-    with pytest.raises(RunError, match="holds no run"):
+    with pytest.raises(RunError, match="does not exist; leave out --resume"):
         small.train(out=tmp_path / "nowhere", resume=True)
     assert not (tmp_path / "nowhere").exists()
 
