@@ -16,10 +16,11 @@ UV ?=
 INSTALL = $(if $(UV),$(UV) pip install --quiet --python $(PY),$(PY) $(PIP_INSTALL))
 TORCH ?= torch==2.13.0
 JOBS ?= 2
+PAGES ?= README.md docs ros2/sidestep_ros/README.md
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce play test test-ros test-wheel check format wheel lock lock-ros docs bench clean
+.PHONY: help setup reproduce play test test-ros test-pages test-wheel check format wheel lock lock-ros docs bench clean
 
 help: ## This list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -68,6 +69,9 @@ test-ros: $(ROS_READY) ## Types and tests of the ROS 2 package, with real ROS 2 
 	$(PY) -m pyright -p ros2
 	$(PY) ros2/private_network.py $(ROS_PY) -m pytest -q -c ros2/sidestep_ros/pytest.ini -n $(JOBS) --dist loadfile \
 	  ros2/sidestep_ros/test $(ARGS)
+
+test-pages: $(READY_DEV) ## Run the code blocks of README and docs (some of them: make test-pages PAGES=docs/own.md)
+	$(PY) -m pytest -q -n $(JOBS) --dist loadfile $(PAGES) $(ARGS)
 
 test-wheel: $(READY_DEV) ## Build the wheel and install it with each extra, outside the clone (needs a package index)
 	$(PY) -m pytest -q -n $(JOBS) -m wheel $(ARGS)
