@@ -21,6 +21,7 @@ from sidestep.bridges.campaigns import run_campaign, worker
 from sidestep.bridges.campaigns.campaign import _Waiting
 from sidestep.bridges.campaigns.cluster import local_size
 from sidestep.cli import main
+from sidestep.store.damage import DamageWarning
 from sidestep.store.lock import FolderInUseError
 from sidestep.trials.campaign import Job, Store
 
@@ -192,9 +193,10 @@ def test_longer_campaign_runs_only_what_is_new(stand_ins, threads, tmp_path):
     # A torn file is found, its job run again; nothing else is.
     torn = sorted((out / "results").glob("*.json"))[0]
     torn.write_bytes(torn.read_bytes()[:-20])
-    outcome = run_campaign(
-        stand_ins.make_campaign(log, 5), out, scheduler=threads.scheduler_address, run=stand_ins.stand_in
-    )
+    with pytest.warns(DamageWarning, match=torn.name):
+        outcome = run_campaign(
+            stand_ins.make_campaign(log, 5), out, scheduler=threads.scheduler_address, run=stand_ins.stand_in
+        )
     assert (outcome.earlier, outcome.ran, outcome.damaged) == (2, 3, 1)
     assert len(stand_ins.runs(log)) == 6
     again = run_campaign(

@@ -203,7 +203,7 @@ def filter_figure(sections: dict[str, Any]) -> Any:
     return figure
 
 
-def _draw_fit(axes: Axes, points: Sequence[tuple[float, float]], power: float) -> None:
+def _draw_fit(axes: Axes, points: Sequence[tuple[float | int, float]], power: float) -> None:
     """The power law through the sizes it was fitted to."""
     sizes, spent = np.log(np.asarray(points, float).T)
     middle = np.mean(spent) + power * (sizes - np.mean(sizes))
