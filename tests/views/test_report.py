@@ -122,7 +122,7 @@ def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, tm
     assert words.index("Paper's shield") < words.index("Game shield") < words.index("Joint shield")
     assert "What the joint shield adds" in words
     assert "20.0 %" in words.partition("periods corrected")[2][:60]
-    assert "0.0100 m/s" in words.partition("mean correction")[2][:60]
+    assert "0.0100" in words.partition("mean correction, m/s")[2][:60]
     # Four shields' single episodes are not drawn, so the caption must not speak of them.
     assert "Faint" not in words
     assert "Faint" in read(whole).words
