@@ -13,13 +13,25 @@ import pytest
 from sidestep import _interrupts
 
 
+@pytest.fixture(autouse=True)
+def as_in_a_terminal():
+    """Ctrl-C raises KeyboardInterrupt, however these tests were started."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def interrupt():
     signal.raise_signal(signal.SIGINT)
 
 
 def program(body):
     """A program that claims Ctrl-C and prints "ready" as its first line, running."""
-    text = "from sidestep import _interrupts\n_interrupts.claim()\nimport os, signal, sys, time\n"
+    # A background shell has its children ignore Ctrl-C.
+    text = (
+        "import os, signal, sys, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from sidestep import _interrupts\n_interrupts.claim()\n"
+    )
     return subprocess.Popen(
         [sys.executable, "-c", text + textwrap.dedent(body)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -133,11 +145,13 @@ def test_what_has_to_happen_first_happens_the_latest_first_and_a_failure_does_no
 
 def test_an_ignored_interrupt_stays_ignored():
     """A shell without job control starts background jobs that way."""
+    body = (
+        "from sidestep import _interrupts as i\ni.claim()\nprint('ready', flush=True)\n"
+        "import time\nwith i.held(): time.sleep(1)"
+    )
     child = subprocess.Popen(
-        [sys.executable, "-c", "from sidestep import _interrupts as i\ni.claim()\n"
-         "print('ready', flush=True)\nimport time\nwith i.held(): time.sleep(1)"],
+        ["sh", "-c", 'trap "" INT; exec "$0" -c "$1"', sys.executable, body],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )  # fmt: skip
     assert ended(child) == (0, "", "")
 
