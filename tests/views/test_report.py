@@ -194,7 +194,7 @@ def test_eight_runs_of_two_shields_are_pooled_and_the_file_stays_small(tmp_path,
     path = write_report(runs, tmp_path / "r.html")
     words = read(path).words
     assert "120 / 120" in words
-    assert "4 of 4 seeds, at 20, 20, 20, 20" in words
+    assert "4 of 4 seeds, first at 20, 20, 20, 20; 4 stayed" in words
     # 0, 10, 20 and 30 captured of 100 each.
     low, high = wilson_interval(60, 400)
     assert f"captured 15.0 % {100 * low:.1f} % to {100 * high:.1f} %" in words
