@@ -51,11 +51,11 @@ evaluation_episodes = 8
 # Checkpoints every 0.2 s instead of every 20, so that short runs have many. The compiled programs are kept
 # before anything imports JAX, as the command does it.
 CHILD = """
-import sys
+import inspect, sys
 from sidestep._compiled import keep_compiled_programs
 keep_compiled_programs()
 import sidestep.learning
-sys.modules["sidestep.learning.train"].train.__kwdefaults__["checkpoint_seconds"] = 0.2
+inspect.unwrap(sys.modules["sidestep.learning.train"].train).__kwdefaults__["checkpoint_seconds"] = 0.2
 from sidestep.cli import main
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))
