@@ -51,7 +51,7 @@ def test_observation_of_another_scenario_is_refused(policy):
 
 
 def test_missing_or_torn_policy_says_so(policy, tmp_path):
-    with pytest.raises(RunError, match="holds no run"):
+    with pytest.raises(RunError, match="does not exist; name a run folder"):
         load_policy(tmp_path / "nowhere")
     create_run(tmp_path / "run", {})
     with pytest.raises(RunError, match=r"no policy yet.*--resume"):
