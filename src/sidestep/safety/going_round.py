@@ -64,9 +64,9 @@ def still_turned(
 ) -> Lanes:
     """The turn of the period before, or 0 where the nominal action gets on by itself: no obstacle's row
     keeps it out, or it slides along all that do to the side that was chosen."""
-    told = _obstacles(scenario, world, nominal)
+    found = _obstacles(scenario, world, nominal)
     # To the left of the nominal action is to the right along what it presses against.
-    free = ~told.hinders | (-turn * told.slides >= LEADS_ON * scenario.evader_speed)
+    free = ~found.hinders | (-turn * found.slides >= LEADS_ON * scenario.evader_speed)
     return jnp.where(fold(jnp.logical_and, free, True), jnp.zeros_like(turn), turn)
 
 
@@ -92,10 +92,10 @@ def next_turn(
     to neither. Where the evader is stuck on its way round too, it turns to the other side. `barriers` (m) are
     those towards the pursuers, -inf where the world was not finite.
     """
-    told, limit = _obstacles(scenario, world, nominal), scenario.evader_speed
+    found, limit = _obstacles(scenario, world, nominal), scenario.evader_speed
     slow = length(action[0] - world.obstacles[:, 2], action[1] - world.obstacles[:, 3]) < STUCK * limit
-    stuck = fold(jnp.logical_or, told.hinders & told.pressing & slow, False)
-    slides = fold(jnp.add, jnp.where(told.hinders, told.slides, 0.0), 0.0)
+    stuck = fold(jnp.logical_or, found.hinders & found.pressing & slow, False)
+    slides = fold(jnp.add, jnp.where(found.hinders, found.slides, 0.0), 0.0)
     chosen = jnp.where(turn == 0.0, jnp.where(slides > 0.0, -1.0, 1.0), -turn)
     far = fold(jnp.minimum, jnp.asarray(barriers), jnp.inf) >= NEAR_PURSUER
     return jnp.where(far, jnp.where(stuck, chosen, turn), 0.0).astype(turn.dtype)
