@@ -4,6 +4,7 @@ import pyarrow.parquet
 import pytest
 
 from sidestep.bridges.campaigns import write_table
+from sidestep.store.files import OutputError
 
 ROWS = [
     {"job": "a", "count": 1, "mixed": 1, "never": None, "starts": [[0.0, 1.0]]},
@@ -32,7 +33,7 @@ def test_failed_write_leaves_the_table_before(tmp_path, monkeypatch):
         raise OSError("full")
 
     monkeypatch.setattr(pyarrow.parquet, "write_table", fail)
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(OutputError, match=r"t\.parquet could not be written: full"):
         write_table(path, ROWS[:1])
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -181,7 +181,7 @@ def test_existing_folder_is_never_overwritten(scenario, found):
 
 
 def test_only_a_search_can_be_resumed(scenario, tmp_path):
-    with pytest.raises(ValueError, match="holds no run"):
+    with pytest.raises(ValueError, match="does not exist; leave out --resume"):
         falsify(scenario, "goal-seeking", "paper", out=tmp_path / "none", episodes=1, resume=True)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ValueError, match="no search"):
