@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -115,14 +116,19 @@ class Child:
         self.process.wait()
 
 
+def files_in(out: Path) -> Iterator[Path]:
+    """The files below a folder in which others come and go meanwhile: `rglob` raises where a folder goes."""
+    return (Path(inside, name) for inside, _, names in os.walk(out) for name in names)
+
+
 def measured(out: Path) -> int:
     """Bytes of what has been measured so far."""
-    return sum(path.stat().st_size for path in out.rglob("metrics.jsonl"))
+    return sum(path.stat().st_size for path in files_in(out) if path.name == "metrics.jsonl")
 
 
 def writes(out: Path) -> set[Path]:
     """The files that are being written, or were when a kill came."""
-    return set(out.rglob(".*.tmp"))
+    return {path for path in files_in(out) if path.name.startswith(".") and path.suffix == ".tmp"}
 
 
 def wait(child: Child, out: Path, sort: str | None, first: float, work: float, chance: random.Random) -> None:
@@ -154,12 +160,14 @@ def wait(child: Child, out: Path, sort: str | None, first: float, work: float, c
 def contents(out: Path) -> dict[str, Any]:
     """What must be the same, by file."""
     found: dict[str, Any] = {}
-    newest = {path: max(path.glob("*.npz"), default=None) for path in out.rglob("checkpoints")}
-    for path in sorted(out.rglob("*")):
+    paths = sorted(files_in(out))
+    kept = {path.parent for path in paths if path.parent.name == "checkpoints"}
+    newest = {folder: max(folder.glob("*.npz"), default=None) for folder in kept}
+    for path in paths:
         name = path.relative_to(out)
         # What a worker of a campaign was writing when it was killed stays beside the results.
         torn = path.suffix == ".tmp" and name.parts[0] == "results"
-        if not path.is_file() or OTHER & set(name.parts) or path.suffix == ".toml" or torn:
+        if OTHER & set(name.parts) or path.suffix == ".toml" or torn:
             continue
         if path.parent in newest and path != newest[path.parent]:
             continue

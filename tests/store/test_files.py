@@ -16,6 +16,7 @@ from sidestep.store.files import (
     append_bytes,
     make_folder,
     read_json,
+    sweep,
     whole_file,
     write_bytes,
     write_json,
@@ -139,3 +140,40 @@ def test_file_that_is_missing_or_no_json_is_named(tmp_path):
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(UnreadableError, match=r"a\.json is not readable JSON"):
         read_json(tmp_path / "a.json")
+
+
+def test_what_kills_left_is_swept_and_what_is_in_use_stays(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    deep = tmp_path / "results"
+    deep.mkdir()
+    for process in (gone.pid, os.getpid()):
+        (deep / f".summary.json.{process}.tmp").touch()
+        (deep / f".sidestep-{process}-x" / "below").mkdir(parents=True)
+        (deep / f".sidestep-{process}-x" / "below" / f".probe.{process}.tmp").touch()
+    for name in (".job.ab12.tmp", ".old.ab12.tmp", "kept.tmp"):
+        (deep / name).touch()
+    os.utime(deep / ".old.ab12.tmp", (0, 0))
+    sweep(tmp_path)
+    assert sorted(path.name for path in deep.iterdir()) == [
+        ".job.ab12.tmp",
+        f".sidestep-{os.getpid()}-x",
+        f".summary.json.{os.getpid()}.tmp",
+        "kept.tmp",
+    ]
+    assert list((deep / f".sidestep-{os.getpid()}-x").rglob("*.tmp"))
+
+
+def test_sweep_passes_over_a_folder_that_vanishes_meanwhile(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    scandir = os.scandir
+
+    def vanishing(place):
+        if os.fspath(place).endswith("b"):
+            os.rmdir(place)
+        return scandir(place)
+
+    monkeypatch.setattr(os, "scandir", vanishing)
+    sweep(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]

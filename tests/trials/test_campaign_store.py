@@ -132,6 +132,7 @@ def test_folder_of_another_program_is_refused_and_not_written_to(tmp_path):
 def test_begin_goes_on_where_a_kill_left_it(tmp_path):
     (tmp_path / "campaign.lock").touch()
     (tmp_path / ".campaign.json.123.tmp").touch()
+    (tmp_path / ".sidestep-123-x").mkdir()
     Store(tmp_path).begin("x", "")
     assert Store(tmp_path).token is not None
 

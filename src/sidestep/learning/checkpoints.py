@@ -152,8 +152,6 @@ def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> 
     )
     for old in list_checkpoints(folder.parent)[:-_KEPT]:
         old.unlink(missing_ok=True)
-    for torn in folder.glob(".*.tmp"):
-        torn.unlink(missing_ok=True)  # Left by a kill in the middle of a write.
     return path
 
 

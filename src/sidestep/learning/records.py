@@ -21,6 +21,7 @@ from sidestep.store.files import (
     json_safe,
     make_folder,
     read_json,
+    sweep,
     write_bytes,
     write_json,
 )
@@ -68,26 +69,8 @@ def writing(folder: str | Path, *inner: str, resume: bool = False) -> Iterator[N
     else:
         _refuse_occupied(folder)
     with hold(folder, *(folder / name for name in inner)):
-        _sweep(folder)
+        sweep(folder)
         yield
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what kills in the middle of `whole_file` have left: files of processes that are gone."""
-    for torn in folder.rglob(".*.tmp"):
-        process = torn.suffixes[-2].removeprefix(".") if len(torn.suffixes) > 1 else ""
-        if process.isdigit() and not _runs(int(process)):
-            torn.unlink(missing_ok=True)
-
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True
 
 
 def held_if_run(folder: str | Path) -> AbstractContextManager[None]:

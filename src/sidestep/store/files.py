@@ -11,6 +11,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -23,6 +24,9 @@ from sidestep import _interrupts
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _STREAMS = {"/dev/stdin": 0, "/dev/stdout": 1, "/dev/stderr": 2}
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
+PROBE = ".sidestep-"
+"""How the name of a folder begins in which `try_outputs` tries to write; the process comes next."""
+_OLD_SECONDS = 3600.0
 
 
 class OutputError(ValueError):
@@ -190,6 +194,41 @@ def _into_stream(path: Path) -> Iterator[Path]:
         (sys.stdout if descriptor == 1 else sys.stderr).flush()
     with writing(path, len(content)), open(path if descriptor is None else os.dup(descriptor), "wb") as file:
         file.write(content)
+
+
+def sweep(folder: str | Path) -> None:
+    """Remove what kills in the middle of `whole_file` and `try_outputs` have left in a folder and below it.
+
+    What names a process counts as left when that process is gone; what names none when it is an hour old.
+    """
+    # Unlike `rglob`, `os.walk` passes over a folder that vanishes meanwhile.
+    for inside, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            path = Path(inside, name)
+            if name.startswith(".") and path.suffix == ".tmp" and _is_left(path, path.stem.split(".")[-1]):
+                path.unlink(missing_ok=True)
+        probe = Path(inside)
+        if probe.name.startswith(PROBE) and _is_left(probe, probe.name.removeprefix(PROBE).split("-")[0]):
+            shutil.rmtree(probe, ignore_errors=True)
+
+
+def _is_left(path: Path, process: str) -> bool:
+    if process.isdigit():
+        return not _runs(int(process))
+    try:
+        return time.time() - path.stat().st_mtime > _OLD_SECONDS
+    except FileNotFoundError:
+        return False
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

@@ -21,6 +21,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from sidestep.store.files import PROBE
+
 LOCK = ".lock"
 _NOTE = ".json"
 _POLL_SECONDS = 0.2
@@ -37,7 +39,10 @@ class FolderInUseError(ValueError):
 
 
 def is_vacant(entry: Path) -> bool:
-    """Whether there is nothing here but what locks leave: a lock file, or a folder of nothing else."""
+    """Whether there is nothing here but what locks and tries of outputs leave: a lock file, a folder of
+    nothing else."""
+    if entry.name.startswith(PROBE):
+        return True
     if entry.is_dir() and not entry.is_symlink():
         return all(is_vacant(each) for each in entry.iterdir())
     return entry.name in (LOCK, LOCK + _NOTE)

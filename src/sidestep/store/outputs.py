@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from sidestep.store.files import OutputError, descriptor_of, is_stream, writing
+from sidestep.store.files import PROBE, OutputError, descriptor_of, is_stream, writing
 
 _PROBE = bytes(4096)
 Paths = Iterable[str | Path | None]
@@ -84,7 +84,7 @@ def _try_folder(named: Path, place: Path) -> None:
     if not there.is_dir():
         raise OutputError(named, f"{named} could not be written: {there} is not a folder")
     missing = place.parent.relative_to(there)
-    probe = Path(tempfile.mkdtemp(prefix=".sidestep-", dir=there))
+    probe = Path(tempfile.mkdtemp(prefix=f"{PROBE}{os.getpid()}-", dir=there))
     try:
         (probe / missing).mkdir(parents=True, exist_ok=True)
         # As long as the name that it is written under at first.

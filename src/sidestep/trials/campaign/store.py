@@ -19,6 +19,7 @@ from sidestep.store.files import (
     json_safe,
     make_folder,
     read_json,
+    sweep,
     sync_folder,
     write_bytes,
     write_json,
@@ -67,6 +68,7 @@ class Store:
             )
         for folder in ("results", "runs", "locks"):
             make_folder(self.folder / folder)
+        sweep(self.folder / "results")
         write_bytes(self.folder / "campaign.toml", text.encode())
 
     @contextmanager
