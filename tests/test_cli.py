@@ -44,6 +44,7 @@ SUMMARY_KEYS = [
     "intervention_rate",
     "infeasible_rate",
     "invalid_rate",
+    "pursuer_invalid",
     "mean_correction",
     "scenario",
     "shield",

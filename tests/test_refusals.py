@@ -11,6 +11,8 @@ import pytest
 from sidestep import evaluate, load_scenario, make_shield, train
 from sidestep.cli import main
 from sidestep.commands.evaluate import evaluation_table
+from sidestep.commands.train import training_table
+from sidestep.learning import make_options
 from sidestep.pursuit import Pursuer
 from sidestep.trials import rollout
 
@@ -134,6 +136,16 @@ def test_pursuer_without_finite_wheel_speeds_is_counted(pursuer):
     assert trajectory.pursuer_invalid == trajectory.length - good
     still = trajectory.worlds.pursuers[good:]
     np.testing.assert_array_equal(still, np.broadcast_to(still[0], still.shape))
+
+
+def test_training_counts_the_pursuer_that_stands_still():
+    small = {"hidden": (8, 8), "batch_size": 8, "warmup_decisions": 10, "replay_capacity": 64}
+    training = train(SMALL, shield="none", pursuer=Lost(), episodes=3, options=make_options(**small), chunk=5)
+    good = round(0.5 / float(SMALL.control_period))
+    counts = [max(line["steps"] - good, 0) for line in training.metrics]
+    assert [line["pursuer_invalid"] for line in training.metrics] == counts
+    assert training.summary["pursuer_invalid"] == sum(counts) > 0
+    assert "not finite" in training_table(training.summary).caption
 
 
 def test_finite_pursuer_is_not_mentioned():

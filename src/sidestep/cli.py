@@ -24,6 +24,7 @@ from sidestep.commands import (
     train,
     twin,
 )
+from sidestep.store.damage import damage_on_stderr
 
 _RUN: dict[type, Callable[..., int]] = {
     train.Train: train.run,
@@ -64,7 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     keep_compiled_programs()
     try:
-        return _RUN[type(command)](command, Console())
+        with damage_on_stderr():
+            return _RUN[type(command)](command, Console())
     except ValueError as error:
         print(f"sidestep: {error}", file=sys.stderr)
         return 2

@@ -41,6 +41,7 @@ def episode(number=1, outcome="reached", total=990.0, steps=100, **more):
         "interventions": 10,
         "infeasible": 1,
         "invalid": 2,
+        "pursuer_invalid": 3,
         "mean_correction": 0.01,
         **more,
     }
@@ -228,6 +229,7 @@ def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
     assert summary["intervention_rate"] == 0.1
     assert summary["infeasible_rate"] == 0.01
     assert summary["invalid_rate"] == 0.02
+    assert summary["pursuer_invalid"] == 3 * 29
     assert summary["mean_correction"] == pytest.approx(0.01)
     # Longer episodes weigh more: the mean is over periods.
     unequal = [episode(1, steps=300, mean_correction=0.04), episode(2, steps=100, mean_correction=0.0)]
@@ -244,8 +246,9 @@ def test_summary_counts_add_up_and_survive_no_episodes(tmp_path):
     assert empty["intervention_rate"] is empty["invalid_rate"] is None
     assert empty["mean_correction"] is None
     # Episodes of a version that did not count them: not known, which is not zero.
-    older = [{name: value for name, value in episode().items() if name != "invalid"}]
-    assert summarise([*older, episode(2)], wall_seconds=0.0, **about)["invalid_rate"] is None
+    for name, figure in (("invalid", "invalid_rate"), ("pursuer_invalid", "pursuer_invalid")):
+        older = {key: value for key, value in episode().items() if key != name}
+        assert summarise([older, episode(2)], wall_seconds=0.0, **about)[figure] is None
     with pytest.raises(RunError, match="crashed"):
         summarise([episode(1, "crashed")], wall_seconds=0.0, **about)
 

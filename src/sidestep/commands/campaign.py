@@ -59,10 +59,9 @@ def run(command: Campaign, console: Console) -> int:
         console.print(f"{plan.name}: {len(plan.jobs)} jobs, {done} of them done in {folder}", highlight=False)
         return 0
     from sidestep.bridges.campaigns import run_campaign
-    from sidestep.store.damage import damage_on_stderr
 
     going = going_on(console, folder, *_again(command, folder))
-    with going, damage_on_stderr(), CampaignBar(console, plan.name) as show:
+    with going, CampaignBar(console, plan.name) as show:
         outcome = run_campaign(
             plan, folder, scheduler=command.scheduler, workers=command.workers,
             threads_per_worker=command.threads_per_worker, progress=show,

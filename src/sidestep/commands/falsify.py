@@ -90,10 +90,9 @@ def run(command: Falsify, console: Console) -> int:
     if command.replay is not None:
         return _replay(command, console)
     from sidestep.learning.records import writing
-    from sidestep.store.damage import damage_on_stderr
 
     with going_on(console, out, *resume_words("falsify", out, command.json)):
-        with damage_on_stderr(), writing(out, resume=command.resume):
+        with writing(out, resume=command.resume):
             found = _search(command, out, console)
         if found.interrupted:
             raise KeyboardInterrupt
@@ -108,7 +107,14 @@ def run(command: Falsify, console: Console) -> int:
 
 def _search(command: Falsify, out: Path, console: Console) -> Falsification:
     """The search, its table and its figures."""
-    from sidestep.trials.falsification import ATTACKS, Plan, certified_clearance, falsify, search_settings
+    from sidestep.trials.falsification import (
+        ATTACKS,
+        Plan,
+        certified_clearance,
+        check_plan,
+        falsify,
+        search_settings,
+    )
 
     stored = search_settings(out) if command.resume else None
     settings = settings_from(command, "shield", "policy", stored=stored)
@@ -116,8 +122,10 @@ def _search(command: Falsify, out: Path, console: Console) -> Falsification:
     names = ("seed", "goal", "attacks", "batch", "seconds", "most")
     if stored is None:
         asked = settings_from(command, *names)
-        guaranteed = certified_clearance(scenario, settings["shield"])
-        plan = Plan(**{**asked, "attacks": command.attacks or ATTACKS}, guaranteed_clearance=guaranteed)
+        plan = Plan(**{**asked, "attacks": command.attacks or ATTACKS})
+        check_plan(scenario, plan, command.minutes, command.episodes)
+        # This takes seconds.
+        plan = replace(plan, guaranteed_clearance=certified_clearance(scenario, settings["shield"]))
     else:
         plan = replace(stored["plan"], **given(command, *names))
     with SearchBar(console) as show:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,7 +19,7 @@ from sidestep.commands.common import (
 )
 from sidestep.commands.physics import (
     about_of,
-    check_amounts,
+    checked,
     draw_beside_simulation,
     episode_table,
     outcome_counts,
@@ -83,10 +82,7 @@ class Fly:
 
 def run(command: Fly, console: Console) -> int:
     """Run `sidestep fly`; returns the exit status."""
-    from sidestep.store.lock import hold
-
-    check_amounts(command)
-    with nullcontext() if command.out is None else hold(command.out):
+    with checked(command):
         return _run(command, console)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,6 +53,16 @@ def check_amounts(command: Twin | Fly) -> None:
 
     log = getattr(command, "log", None)
     try_outputs(files=[command.json, command.video], new=[log], folders=[command.out])
+
+
+@contextmanager
+def checked(command: Twin | Fly) -> Iterator[None]:
+    """While this lasts, the folder that the command writes is held; its amounts are checked before."""
+    from sidestep.store.lock import hold
+
+    check_amounts(command)
+    with nullcontext() if command.out is None else hold(command.out):
+        yield
 
 
 def video_options(command: Twin | Fly) -> dict[str, Any]:

@@ -64,13 +64,12 @@ class Reproduce:
 def run(command: Reproduce, console: Console) -> int:
     """Run `sidestep reproduce`; returns the exit status."""
     from sidestep.learning.records import writing
-    from sidestep.store.damage import damage_on_stderr
     from sidestep.store.outputs import try_outputs
 
     try_outputs(files=[command.json], folders=[command.out])
     resume = command.resume and (command.out / "config.json").is_file()
     going = going_on(console, command.out, *resume_words("reproduce", command.out, command.json))
-    with going, damage_on_stderr(), writing(command.out, resume=resume):
+    with going, writing(command.out, resume=resume):
         _study(command, resume, console)
     return 0
 

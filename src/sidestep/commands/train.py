@@ -19,6 +19,7 @@ from sidestep.commands.common import (
     say,
     scenario_from,
     settings_from,
+    stood_still,
     unless_given,
     write_json_file,
 )
@@ -59,12 +60,11 @@ def run(command: Train, console: Console) -> int:
     """Run `sidestep train`; returns the exit status."""
     from sidestep.learning import resume_settings
     from sidestep.learning import train as run_training
-    from sidestep.store.damage import damage_on_stderr
     from sidestep.store.outputs import try_outputs
 
     try_outputs(files=[command.json], folders=[command.out])
     going = going_on(console, command.out, *resume_words("train", command.out, command.json))
-    with going, damage_on_stderr():
+    with going:
         stored = resume_settings(command.out) if command.resume else None
         settings = settings_from(command, "shield", "pursuer", "seed", "episodes", stored=stored)
         settings["scenario"] = scenario_from(command, settings.get("scenario"))
@@ -102,4 +102,6 @@ def training_table(summary: dict[str, Any]) -> Any:
         value = summary[key]
         shown = "never" if value is None and key.startswith("converged") else value
         table.add_row(key.replace("_", " "), f"{shown:.4g}" if isinstance(shown, float) else str(shown))
+    if summary["pursuer_invalid"]:
+        table.caption = f"Warning: {stood_still(summary['pursuer_invalid'])}"
     return table

@@ -294,9 +294,10 @@ def summarise(
     20 episodes, of all if fewer),
     the smallest clearances (m), and the shares of control periods in which the shield corrected the action
     (`intervention_rate`), could not satisfy its rows (`infeasible_rate`) or was given numbers that are not
-    finite (`invalid_rate`), and how far it changed the velocity on average over all of them
-    (`mean_correction`, m/s). What needs an episode is null without one, and so is `invalid_rate` where
-    episodes of an earlier version did not count those periods.
+    finite (`invalid_rate`), how far it changed the velocity on average over all of them
+    (`mean_correction`, m/s), and the control periods in which a pursuer's wheel speeds were not finite and it
+    stood still (`pursuer_invalid`). What needs an episode is null without one, and so are `invalid_rate` and
+    `pursuer_invalid` where episodes of an earlier version did not count those periods.
     """
     counts = {name: sum(episode["outcome"] == name for episode in metrics) for name in OUTCOMES}
     if sum(counts.values()) != len(metrics):
@@ -309,8 +310,12 @@ def summarise(
         values = [float(episode[key]) for episode in metrics if episode.get(key) is not None]
         return min(values) if values else None
 
+    def total(key: str) -> int | None:
+        return sum(int(line[key]) for line in metrics) if all(key in line for line in metrics) else None
+
     def share(key: str) -> float | None:
-        return sum(int(episode[key]) for episode in metrics) / steps if steps else None
+        count = total(key)
+        return count / steps if steps and count is not None else None
 
     # An episode's is the mean over its own periods.
     correction = sum(float(episode["mean_correction"]) * int(episode["steps"]) for episode in metrics)
@@ -329,7 +334,8 @@ def summarise(
             "min_obstacle_clearance": smallest("min_obstacle_clearance"),
             "intervention_rate": share("interventions"),
             "infeasible_rate": share("infeasible"),
-            "invalid_rate": share("invalid") if all("invalid" in line for line in metrics) else None,
+            "invalid_rate": share("invalid"),
+            "pursuer_invalid": total("pursuer_invalid"),
             "mean_correction": correction / steps if steps else None,
             **about,
         }

@@ -91,6 +91,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
                 "interventions": tally.interventions[i],
                 "infeasible": tally.infeasible[i],
                 "invalid": tally.invalid[i],
+                "pursuer_invalid": tally.pursuer_invalid[i],
                 "mean_correction": tally.correction[i] / tally.steps[i],
             }
         )

@@ -15,13 +15,15 @@ from sidestep.learning.control_step import RUNNING, control_step, nominal_veloci
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Learner, Losses, update
+from sidestep.pursuit import without_answer
 from sidestep.safety.status import Status
 from sidestep.world import Scenario, World, observation_size, observe
 
 
 class Tally(eqx.Module):
     """What one episode has come to so far. Clearances in m, correction in m/s summed over periods; periods
-    that the shield corrected, those of them with rows that could not hold, and with input not finite."""
+    that the shield corrected, those of them with rows that could not hold, and with input not finite, and
+    periods in which a pursuer's wheel speeds were not finite."""
 
     total_reward: Scalar
     steps: Count
@@ -30,12 +32,13 @@ class Tally(eqx.Module):
     interventions: Count
     infeasible: Count
     invalid: Count
+    pursuer_invalid: Count
     correction: Scalar
 
     @classmethod
     def init(cls) -> Tally:
         zero, count, far = real(0.0), jnp.zeros((), int), real(jnp.inf)
-        return cls(zero, count, far, far, count, count, count, zero)
+        return cls(zero, count, far, far, count, count, count, count, zero)
 
 
 class TrainState(eqx.Module):
@@ -124,7 +127,7 @@ def _drive(
     """Hold the nominal velocity for a decision; nothing moves any more once the episode has ended."""
 
     def period(carry: _Drive, key: PRNGKeyArray) -> tuple[_Drive, Float[Array, "2"]]:
-        world, memory, events, result, _ = control_step(
+        world, memory, events, result, wheels = control_step(
             scenario, shield, pursuer, carry.world.set_apart(~carry.alive), carry.memory, nominal, key
         )
         tally = carry.tally
@@ -139,6 +142,7 @@ def _drive(
                 interventions=tally.interventions + (result.status != Status.OK).astype(tally.steps.dtype),
                 infeasible=tally.infeasible + (result.status == Status.INFEASIBLE).astype(tally.steps.dtype),
                 invalid=tally.invalid + (result.status == Status.INVALID).astype(tally.steps.dtype),
+                pursuer_invalid=tally.pursuer_invalid + without_answer(wheels).astype(tally.steps.dtype),
                 correction=tally.correction + result.intervention,
             ),
             alive=~(events.terminated | events.truncated),

@@ -101,6 +101,9 @@ def comparison(
             sum(_pooled(g, key)) / s if s else None for g, s in zip(groups.values(), steps, strict=True)
         ]
         add(name, "–", [percent(share) for share in shares])
+    still = [sum(_pooled(group, "pursuer_invalid")) for group in groups.values()]
+    if any(still):
+        add("periods in which a pursuer stood still", "–", [str(count) for count in still])
     corrections = [
         sum(float(e["mean_correction"]) * int(e["steps"]) for run in group for e in run.metrics) / periods
         if periods

@@ -11,7 +11,7 @@ from sidestep.trials.falsification.counterexamples import (
     replay,
     write_counterexample,
 )
-from sidestep.trials.falsification.search import falsify
+from sidestep.trials.falsification.search import check_plan, falsify
 from sidestep.trials.falsification.tallies import Falsification, Plan, Progress
 from sidestep.trials.falsification.verdict import ASSUMPTIONS, Verdict, certified_clearance, judge
 
@@ -27,6 +27,7 @@ __all__ = [
     "Replay",
     "Verdict",
     "certified_clearance",
+    "check_plan",
     "falsify",
     "judge",
     "read_counterexample",

@@ -61,8 +61,15 @@ _EXAMINED = 16
 _DEEPER = 1e-4
 
 
-def check_plan(scenario: Scenario, plan: Plan) -> None:
-    """**Raises** `ValueError` naming what cannot be searched for, its value and what is allowed."""
+def check_plan(
+    scenario: Scenario, plan: Plan, minutes: float | None = None, episodes: int | None = None
+) -> None:
+    """**Raises** `ValueError` naming what cannot be searched for, or not for so long, its value and what is
+    allowed."""
+    if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
+        raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
+    if episodes is not None:
+        whole_number("episodes", episodes)
     if plan.goal not in GOALS:
         raise ValueError(f"goal = {plan.goal!r}: it must be one of {', '.join(map(repr, GOALS))}")
     if plan.goal == "collision" and scenario.obstacle_count == 0:
@@ -112,10 +119,6 @@ def falsify(
     """
     folder = Path(out)
     source = policy if isinstance(policy, (str, Path)) else None
-    if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
-        raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
-    if episodes is not None:
-        whole_number("episodes", episodes)
     stored = open_run(folder, "falsification", otherwise=NOT_BEGUN) if resume else None
     if stored is not None:
         plan = plan_for(stored, plan)
@@ -125,7 +128,7 @@ def falsify(
         "the falsifier", "search with evaluate, over pursuers and starts, or falsify the problem that covers "
         "theirs, sidestep.safety.covered(of_control_point(scenario))",
     )  # fmt: skip
-    check_plan(scenario, plan)
+    check_plan(scenario, plan, minutes, episodes)
     shield_called = shield_name(shield, scenario)
     about = {
         "kind": "falsification",
