@@ -215,6 +215,14 @@ def test_decision_of_the_core_is_logged_as_it_is(tmp_path):
     assert read.topics["/diagnostics"][0][1].status[0].level == 2
 
 
+@pytest.mark.parametrize("stamp", [-0.1, 2.0**31, float("nan"), float("inf")])
+def test_time_that_a_log_cannot_hold_is_refused_by_its_value(tmp_path, stamp):
+    with LogWriter(tmp_path / "x.mcap", load_scenario("paper")) as log:
+        with pytest.raises(ValueError, match=f"stamp = {stamp!r}".replace("+", r"\+")):
+            log.target(stamp, (0.0, 0.0))
+        log.target(0.0, (0.0, 0.0))
+
+
 def test_files_that_are_no_logs_are_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match=r"no log .*nothing\.mcap"):
         load_log(tmp_path / "nothing.mcap")

@@ -59,7 +59,12 @@ def definition(name: str) -> str:
 
 
 def nanoseconds(stamp: float) -> int:
-    """A time in s as whole nanoseconds."""
+    """A time in s as whole nanoseconds.
+
+    **Raises** `ValueError` outside of what a log can hold: MCAP counts from 0, ROS up to 2^31 s.
+    """
+    if not 0.0 <= stamp < 2**31:
+        raise ValueError(f"stamp = {stamp!r}: a time in a log must be from 0 to 2^31 s")
     return round(stamp * 1e9)
 
 
