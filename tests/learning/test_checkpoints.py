@@ -168,6 +168,30 @@ def test_kill_at_any_write_leaves_a_run_that_can_be_resumed(small, whole, tmp_pa
     assert 1 <= unstarted <= 5
 
 
+def test_run_killed_before_its_first_checkpoint_and_again_before_its_next_goes_on(
+    small, whole, tmp_path, monkeypatch
+):
+    class Killed(BaseException):
+        pass
+
+    def kill(*_, **__):
+        raise Killed
+
+    monkeypatch.setattr(sys.modules["sidestep.learning.train"], "write_checkpoint", kill)
+    with pytest.raises(Killed):
+        small.train(out=tmp_path / "run")
+    monkeypatch.undo()
+    assert not list((tmp_path / "run" / "checkpoints").iterdir())
+
+    def copy(progress):
+        if progress.episode >= 1 and not (tmp_path / "again").exists():
+            shutil.copytree(tmp_path / "run", tmp_path / "again")
+
+    same_run(small, small.train(out=tmp_path / "run", resume=True, progress=copy), whole)
+    assert read_metrics(tmp_path / "again")
+    same_run(small, small.train(out=tmp_path / "again", resume=True), whole)
+
+
 CHILD = """
 import json, sys
 from sidestep.learning import make_options, train

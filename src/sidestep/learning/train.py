@@ -295,8 +295,9 @@ def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
 def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tuple[TrainState, float]:
     """The state to continue from, the run's files cut back to it."""
     if not list_checkpoints(folder) and not records.read_metrics(folder):
-        # Killed before its first checkpoint: it resumes at its start.
+        # Killed before its first checkpoint: it resumes at its start, which another kill must find too.
         state, wall_seconds = example, 0.0
+        write_checkpoint(folder, state, wall_seconds=wall_seconds)
     else:
         state, manifest = read_checkpoint(folder, example)
         wall_seconds = float(manifest["wall_seconds"])
