@@ -5,6 +5,7 @@ whose `sidestep` hands the words over to this process: here the real command run
 cannot be run is listed in `LEFT_OUT`, with the reason.
 """
 
+import atexit
 import contextlib
 import io
 import json
@@ -26,12 +27,17 @@ from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Most of the run is compilation, and tests compute little: a third of the time that it takes as users have it.
+# Most of the run is compilation, and tests compute little: so it takes a third of the time.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1",
 )
+# What one process compiles, the other test processes and their children load: this one starts them all.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="sidestep-tests-")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 import pytest
 from sybil import Document, Example, Region, Sybil

@@ -66,18 +66,3 @@ def _compiled_programs_are_let_go() -> Iterator[None]:
     yield
     if _memory() > _MOST_MEMORY:
         jax.clear_caches()
-
-
-@pytest.fixture(scope="session")
-def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What this process compiles from now on, its child processes load instead of compiling it again."""
-    from jax.experimental.compilation_cache import compilation_cache
-
-    folder = str(tmp_path_factory.mktemp("compiled"))
-    compilation_cache.reset_cache()
-    jax.config.update("jax_compilation_cache_dir", folder)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-    yield
-    del os.environ["JAX_COMPILATION_CACHE_DIR"]
-    jax.config.update("jax_compilation_cache_dir", None)
-    compilation_cache.reset_cache()

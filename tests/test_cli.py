@@ -55,7 +55,7 @@ SUMMARY_KEYS = [
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, compiled_programs):
+def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     out = folder / "run"
     assert main(["train", "--out", str(out), "--json", str(folder / "s.json"), "--seed", "5", *SMALL]) == 0

@@ -50,7 +50,7 @@ def _no_figures():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, compiled_programs):
+def whole(tmp_path_factory):
     """Each command, run to its end. Not to be written to."""
     folder = tmp_path_factory.mktemp("whole")
     for name, words in BEGIN.items():

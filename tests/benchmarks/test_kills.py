@@ -4,14 +4,14 @@ import kills
 import pytest
 
 
-def test_killed_training_ends_as_if_nothing_had_been(compiled_programs, capsys):
+def test_killed_training_ends_as_if_nothing_had_been(capsys):
     assert kills.main(["train", "--kills", "3", "--episodes", "40", "--seed", "1"]) == 0
     assert "train: 3 kills" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "reproduce", "campaign"])
-def test_killed_command_ends_as_if_nothing_had_been(command, compiled_programs):
+def test_killed_command_ends_as_if_nothing_had_been(command):
     assert kills.main([command, "--kills", "20"]) == 0
 
 

@@ -80,11 +80,6 @@ def differences(first, second):
     ]
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _share_with_child_processes(compiled_programs: None) -> None:
-    """Everything here compiles into the cache that child processes read."""
-
-
 @pytest.fixture(scope="session")
 def small() -> SimpleNamespace:
     """The helpers above, by short names."""
