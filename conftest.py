@@ -7,6 +7,7 @@ cannot be run is listed in `LEFT_OUT`, with the reason.
 
 import atexit
 import contextlib
+import gc
 import io
 import json
 import os
@@ -25,6 +26,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+from sybil import Document, Example, Region, Sybil
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.markdown.lexers import FencedCodeBlockLexer
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Most of the run is compilation, and tests compute little: so it takes a third of the time.
@@ -33,16 +39,13 @@ os.environ.setdefault(
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1",
 )
+# Tracing makes millions of objects that stay, and by default a fifth of the run looks for garbage in them.
+gc.set_threshold(200_000, 20, 100)
 # What one process compiles, the other test processes and their children load: this one starts them all.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="sidestep-tests-")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
-
-import pytest
-from sybil import Document, Example, Region, Sybil
-from sybil.evaluators.python import PythonEvaluator
-from sybil.parsers.markdown.lexers import FencedCodeBlockLexer
 
 ROOT = Path(__file__).parent
 

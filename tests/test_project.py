@@ -164,6 +164,7 @@ NEEDS = {
     "train_with_sb3.py": ("stable_baselines3", "stable-baselines3"),
     "train_with_sbx.py": ("sbx", "sbx-rl"),
 }
+LONG = ("animate_chase.py", "car_pursuer.py")
 BRIEFLY = ("--steps", "60", "--episodes", "1", "--shield", "none")
 
 
@@ -215,7 +216,13 @@ def test_blocks_that_are_left_out_are_on_the_pages(request):
         assert re.search(rf"^```(sh|python)\n{re.escape(beginning)}", text(page), re.MULTILINE), beginning
 
 
-@pytest.mark.parametrize("example", sorted(path.name for path in (ROOT / "examples").glob("*.py")))
+@pytest.mark.parametrize(
+    "example",
+    [
+        pytest.param(path.name, marks=[pytest.mark.slow] if path.name in LONG else [])
+        for path in sorted((ROOT / "examples").glob("*.py"))
+    ],
+)
 def test_examples_run(example):
     module, package = NEEDS.get(example, ("sidestep", ""))
     if importlib.util.find_spec(module) is None:

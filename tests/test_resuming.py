@@ -140,7 +140,7 @@ def interrupt_after(calls, monkeypatch):
     monkeypatch.setattr(SearchBar, "update", update)
 
 
-@pytest.mark.parametrize("name", BEGIN)
+@pytest.mark.parametrize("name", ["train", "falsify", pytest.param("reproduce", marks=pytest.mark.slow)])
 def test_advice_after_an_interrupt_pasted_into_a_shell_does_the_rest(
     whole, name, tmp_path, monkeypatch, capsys
 ):

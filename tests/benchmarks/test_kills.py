@@ -5,8 +5,8 @@ import pytest
 
 
 def test_killed_training_ends_as_if_nothing_had_been(capsys):
-    assert kills.main(["train", "--kills", "3", "--episodes", "40", "--seed", "1"]) == 0
-    assert "train: 3 kills" in capsys.readouterr().out
+    assert kills.main(["train", "--kills", "2", "--episodes", "30", "--seed", "1"]) == 0
+    assert "train: 2 kills" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -186,6 +186,7 @@ def test_the_aircraft_flies_arcs_along_its_heading(scene, start):
     np.testing.assert_allclose(np.hypot(*ways[-10:, :2].T), 0.05, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_scene_is_lost_without_a_shield_and_won_with_one(scene, start, pilot):
     certificate = certificate_of(scene, FlightOptions(), check_shield=False)
     assert certificate.guaranteed
@@ -213,6 +214,7 @@ def test_wind_that_the_budget_does_not_know_of_is_reported(scene, start, pilot):
     assert np.max(windy.tracking_errors) > windy.options.tracking_error
 
 
+@pytest.mark.slow
 def test_the_certificate_counts_what_the_flight_cannot_know(scene):
     exact, poor = (
         certificate_of(scene, FlightOptions(tracking_error=error), check_shield=False) for error in (0.0, 0.2)

@@ -195,7 +195,16 @@ def test_worlds_side_by_side_live_through_what_each_does_alone(mode):
     assert ends.min() > 3
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize(
+    "mode",
+    [
+        AutoresetMode.NEXT_STEP,
+        *(
+            pytest.param(mode, marks=pytest.mark.slow)
+            for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+        ),
+    ],
+)
 def test_the_number_of_threads_changes_nothing(mode, monkeypatch):
     monkeypatch.setattr(vector_module, "useful_threads", lambda most: most)
     make = lambda threads: PursuedVectorEnv(  # noqa: E731

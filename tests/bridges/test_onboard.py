@@ -18,19 +18,6 @@ FAR = {"pursuer": (3.0, 0.0, ACROSS), "obstacle": (0.0, 3.0)}
 WISH = np.array([0.1, 0.05])
 
 
-@pytest.fixture(scope="module")
-def core():
-    made = Onboard(SCENARIO, "game")
-    made.warm_up()
-    return made
-
-
-@pytest.fixture
-def onboard(core):
-    core.reset()
-    return core
-
-
 def run(onboard, periods, begin=0, *, pursuer=FAR["pursuer"], without=(), wish=WISH, decide=True):
     """Feed everything but `without` and decide, once a period; the last decision."""
     decision = None

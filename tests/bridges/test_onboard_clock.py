@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sidestep.bridges.onboard import Onboard, OnboardSettings, Reading
+from sidestep.bridges.onboard import OnboardSettings, Reading
 from sidestep.world import load_scenario
 
 PERIOD = 0.05
@@ -20,19 +20,6 @@ CAPTURE = 0.15
 SCENARIO = load_scenario("paper", capture_distance=CAPTURE)
 FAR = {"evader": (0.0, 0.0, 0.0), "pursuer": (3.0, 0.0, math.pi / 2.0), "obstacle": (0.0, 3.0)}
 JUMP = 30
-
-
-@pytest.fixture(scope="module")
-def core():
-    made = Onboard(SCENARIO, "game")
-    made.warm_up()
-    return made
-
-
-@pytest.fixture
-def onboard(core):
-    core.reset()
-    return core
 
 
 def cycle(onboard, now, stamp=None, without=(), **more):

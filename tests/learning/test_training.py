@@ -19,6 +19,7 @@ from sidestep.safety import as_shield
 from sidestep.world import observe
 
 
+@pytest.mark.slow
 def test_training_stops_exactly_at_its_last_episode_whatever_the_chunk(small, small_run):
     other = small.train(chunk=7)
     assert len(small_run.metrics) == 8

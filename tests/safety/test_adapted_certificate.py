@@ -29,6 +29,7 @@ def scenario():
     return load_scenario("quadrotor")
 
 
+@pytest.mark.slow
 def test_the_certificate_is_that_of_the_robots_that_stand_for_them(scenario):
     ours = certify(scenario, position_error=0.02, check_shield=False)
     theirs = certify(covered(of_control_point(scenario)), position_error=0.02, check_shield=False)

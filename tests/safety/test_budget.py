@@ -122,6 +122,7 @@ def test_a_budget_beyond_what_the_game_leaves_is_said_once_and_kept_as_well_as_c
     assert int(_captured(scenario, shield, keys, *wrong)) == 0
 
 
+@pytest.mark.slow
 def test_a_budget_within_the_game_is_silent_and_the_certificate_agrees_about_its_size():
     scenario = load_scenario("paper", capture_distance=0.17, control_period=0.01, obstacle_count=0)
     parts = {"position_error": 0.001, "heading_error": 0.002, "delay": 0.01, "tracking_error": 0.002}

@@ -99,6 +99,7 @@ def test_nothing_is_guaranteed_inside_walls_or_against_several(options, fields, 
     assert any(claim.kind == "not claimed" and word in claim.text for claim in found.claims)
 
 
+@pytest.mark.slow
 def test_where_the_pursuer_wins_time_and_targets_are_answered():
     scenario = load_scenario("paper", pursuer_speed=0.25)
     found = certify(scenario, check_shield=False, start=(0.6, 0.0), target_distance=0.1)

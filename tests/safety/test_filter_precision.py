@@ -12,6 +12,9 @@ import pytest
 import sidestep.safety
 from sidestep.safety import Status, project, tolerance
 
+# With the instructions that users' programs have: other tests are compiled more quickly, see conftest.py.
+as_users = functools.partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": True})
+
 
 def _exact_distance(nominal, normals, offsets, limit):
     """Distance from `nominal` to the feasible set in 60-digit arithmetic; None where that is empty.
@@ -60,7 +63,7 @@ def _exact_distance(nominal, normals, offsets, limit):
 def test_an_answer_is_exact_up_to_moving_each_row_by_rounding(precision, problems, family, k):
     dtype = np.dtype(np.float64 if precision else np.float32)
     batch = problems(250, k, seed=5, families=(family,)).cast(dtype)
-    answer = jax.jit(jax.vmap(project, in_axes=(0, 0, 0, None)))(
+    answer = as_users(jax.vmap(project, in_axes=(0, 0, 0, None)))(
         batch.nominal, batch.normals, batch.offsets, dtype.type(batch.limit)
     )
     assert answer.action.dtype == dtype
@@ -92,7 +95,7 @@ def test_rows_and_limit_are_kept_to_rounding(precision, problems):
     dtype = np.dtype(np.float64 if precision else np.float32)
     for k in (2, 8):
         batch = problems(3000, k, seed=6).cast(dtype)
-        answer = jax.jit(jax.vmap(project, in_axes=(0, 0, 0, None)))(
+        answer = as_users(jax.vmap(project, in_axes=(0, 0, 0, None)))(
             batch.nominal, batch.normals, batch.offsets, dtype.type(batch.limit)
         )
         action = np.asarray(answer.action, np.float64)
@@ -114,7 +117,7 @@ def test_single_precision_tells_the_same_story_as_double(problems):
         answers = []
         for wide, given in ((False, single), (True, single.cast(np.dtype(np.float64)))):
             with jax.enable_x64(wide):
-                answer = jax.jit(jax.vmap(functools.partial(project, hard=hard), in_axes=(0, 0, 0, None)))(
+                answer = as_users(jax.vmap(functools.partial(project, hard=hard), in_axes=(0, 0, 0, None)))(
                     given.nominal, given.normals, given.offsets, float(np.float32(batch.limit))
                 )
                 answers.append((np.asarray(answer.action, np.float64), np.asarray(answer.status)))
@@ -137,7 +140,7 @@ def test_single_precision_tells_the_same_story_as_double(problems):
 
 def test_huge_and_tiny_numbers_cost_no_digits(precision):
     dtype = jnp.zeros(()).dtype
-    project = jax.jit(sidestep.safety.project)
+    project = as_users(sidestep.safety.project)
     far = jnp.array([3.0, 4.0]) * (1e30 if dtype == jnp.float32 else 1e200)
     result = project(far, jnp.array([[1.0, 0.0]]), jnp.array([-1.0]), jnp.asarray(0.1))
     np.testing.assert_allclose(result.action, [0.06, 0.08], rtol=1e-5)

@@ -412,7 +412,9 @@ def _at_the_axis(count, seed):
     return worlds, 0.1574 * np.stack([-sine, cosine], axis=-1)
 
 
-@pytest.mark.parametrize("acceleration, depends", [(None, True), (2.0, False)])
+@pytest.mark.parametrize(
+    "acceleration, depends", [(None, True), pytest.param(2.0, False, marks=pytest.mark.slow)]
+)
 def test_a_wish_that_is_not_driven_changes_no_side_of_a_robot_with_motors(acceleration, depends):
     """Where nothing is clear the way that touches last is driven, and that is no matter of the wish."""
     scenario = load_scenario("paper-test")
@@ -436,6 +438,7 @@ def test_a_wish_that_is_not_driven_changes_no_side_of_a_robot_with_motors(accele
     assert differ[rejected].any() == depends
 
 
+@pytest.mark.slow
 def test_a_robot_with_motors_goes_on_looking_ahead_until_well_away():
     """A look-ahead that sets in and breaks off would have it turn to and fro."""
     scenario = load_scenario("paper-test")

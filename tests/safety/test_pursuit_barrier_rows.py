@@ -93,7 +93,8 @@ def test_some_velocity_keeps_the_row_whatever_the_wheels_and_the_gain(x64, param
         assert free.mean() > 0.5
         np.testing.assert_allclose(jnp.sum(normal**2, axis=-1), 1.0, atol=1e-12)
         assert np.all(worst[free] <= scenario.evader_speed + 1e-9)
-        assert np.all(offset <= worst)
+        # Equal where the wheels are the worst ones, up to how each is rounded.
+        assert np.all(offset <= worst + 1e-12)
 
 
 @every_set

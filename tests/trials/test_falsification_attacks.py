@@ -176,6 +176,7 @@ def searched(target):
     return search_starts(target, PLANNING, bases, free, "capture", jax.random.key(2))
 
 
+@pytest.mark.slow
 def test_search_with_the_shield_in_the_loop_improves():
     target = Target(EMPTY, goal_seeking, make_shield("paper", EMPTY))
     starts, knots, found = searched(target)

@@ -185,6 +185,7 @@ def test_runs_of_other_scenarios_are_not_compared_in_silence(whole, tmp_path, ru
     assert "like with like" not in read(whole).words
 
 
+@pytest.mark.slow
 def test_eight_runs_of_two_shields_are_pooled_and_the_file_stays_small(tmp_path, run_of, survey_of):
     runs = [
         replace(run_of(shield, seed=seed), survey=survey_of(), evaluation=evaluation(10 * seed))
