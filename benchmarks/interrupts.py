@@ -136,14 +136,21 @@ class Study:
                 raise SystemExit(f"left alone it ended with {child.returncode}: {text[-2000:]}")
             return time.monotonic() - begun
 
-    def interrupt(self, number: int, within: float) -> None:
-        """Once, at a random moment; a command that has ended by then is started again."""
+    def interrupt(self, number: int, within: float) -> float:
+        """Once, at a random moment; a command that has ended by then is started again.
+
+        **Returns** `within`, or the time in which such a command ended: less than the first run, which
+        compiled.
+        """
         while True:
             out = Path(tempfile.mkdtemp())
-            child = start(self.words(out), out)
+            child, begun = start(self.words(out), out), time.monotonic()
             delay = self.chance.uniform(0.15, within)
-            time.sleep(delay)
+            while child.poll() is None and time.monotonic() < begun + delay:
+                time.sleep(0.005)
             ended = child.poll() is not None
+            if ended and child.returncode == 0:
+                within = time.monotonic() - begun
             begun = time.monotonic()
             child.send_signal(signal.SIGINT)
             text, _ = child.communicate()
@@ -163,6 +170,7 @@ class Study:
             if advice is not None and number % self.paste_every == 0:
                 self.paste(advice[1], out, delay)
         shutil.rmtree(out)
+        return within
 
     def paste(self, line: str, out: Path, delay: float) -> None:
         """What was printed, in a shell, must finish the work."""
@@ -208,7 +216,7 @@ def main() -> int:
                 study = Study(name, run, random.Random(f"{options.seed} {name}"), options.paste_every)
                 within = study.length()
                 for number in range(options.count):
-                    study.interrupt(number, within)
+                    within = study.interrupt(number, within)
                 results[name] = {
                     "interrupts": options.count,
                     "statuses": {str(status): count for status, count in study.statuses.items()},
