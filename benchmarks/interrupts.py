@@ -159,11 +159,12 @@ class Study:
             shutil.rmtree(out)
         self.waits.append(time.monotonic() - begun)
         self.statuses[child.returncode] += 1
-        # Until the first line of this package runs, Ctrl-C is Python's own affair.
+        # Until the first line of this package runs, Ctrl-C is Python's own affair. When the work is done, and
+        # Python shuts down, it is the system's: a shell shows 130 for that too.
         if child.returncode != 130 and "sidestep" not in text:
             self.early += 1
         else:
-            trouble = [f"status {child.returncode}"] if child.returncode != 130 else []
+            trouble = [f"status {child.returncode}"] if child.returncode not in (130, -signal.SIGINT) else []
             trouble += [line for line in text.splitlines() if TROUBLE.search(line)][:3] + unreadable(out)
             self.faults += [f"{delay:.2f} s: {what}" for what in trouble]
             advice = ADVICE.search(text)
