@@ -187,23 +187,23 @@ def play(words: list[str]) -> int:
     """Serves the page until it has been asked for once, then ends it as Ctrl-C does."""
     import urllib.request
 
-    serving = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-m", "sidestep", *words, "--port", "0"],
         env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
-    assert serving.stdout is not None
-    told = ""
-    for line in serving.stdout:
-        told += line
-        if found := re.search(r"http://[\w.:\[\]]+/", told):
-            with urllib.request.urlopen(found[0], timeout=60) as page:
-                assert b"sidestep" in page.read()
-            serving.send_signal(signal.SIGINT)
-            break
-    told += serving.stdout.read()
+    ) as serving:  # fmt: skip
+        assert serving.stdout is not None
+        told = ""
+        for line in serving.stdout:
+            told += line
+            if found := re.search(r"http://[\w.:\[\]]+/", told):
+                with urllib.request.urlopen(found[0], timeout=60) as page:
+                    assert b"sidestep" in page.read()
+                serving.send_signal(signal.SIGINT)
+                break
+        told += serving.stdout.read()
     print(told)
-    return 0 if serving.wait() in (0, 130) else 1
+    return 0 if serving.returncode in (0, 130) else 1
 
 
 def evaluator(example: Example) -> None:
