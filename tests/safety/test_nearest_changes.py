@@ -54,7 +54,6 @@ def check(situation, changes):
         pytest.param(LOST, ALL, marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.slow
 def test_each_suggestion_as_printed_is_guaranteed_and_a_tenth_less_is_not(situation, mine):
     assert not guaranteed(situation)
     alone, pairs = found(situation, mine)

@@ -151,13 +151,16 @@ def test_what_kills_left_is_swept_and_what_is_in_use_stays(tmp_path):
         (deep / f".summary.json.{process}.tmp").touch()
         (deep / f".sidestep-{process}-x" / "below").mkdir(parents=True)
         (deep / f".sidestep-{process}-x" / "below" / f".probe.{process}.tmp").touch()
-    for name in (".job.ab12.tmp", ".old.ab12.tmp", "kept.tmp"):
+    result, old = (f".job.{letter * 32}.tmp" for letter in "ab")
+    for name in (result, old, ".somebodys.tmp", "kept.tmp"):
         (deep / name).touch()
-    os.utime(deep / ".old.ab12.tmp", (0, 0))
+    for name in (old, ".somebodys.tmp", "kept.tmp"):
+        os.utime(deep / name, (0, 0))
     sweep(tmp_path)
     assert sorted(path.name for path in deep.iterdir()) == [
-        ".job.ab12.tmp",
+        result,
         f".sidestep-{os.getpid()}-x",
+        ".somebodys.tmp",
         f".summary.json.{os.getpid()}.tmp",
         "kept.tmp",
     ]

@@ -26,6 +26,7 @@ _STREAMS = {"/dev/stdin": 0, "/dev/stdout": 1, "/dev/stderr": 2}
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 PROBE = ".sidestep-"
 """How the name of a folder begins in which `try_outputs` tries to write; the process comes next."""
+_RESULT = re.compile(r"[0-9a-f]{32}")
 _OLD_SECONDS = 3600.0
 
 
@@ -199,7 +200,8 @@ def _into_stream(path: Path) -> Iterator[Path]:
 def sweep(folder: str | Path) -> None:
     """Remove what kills in the middle of `whole_file` and `try_outputs` have left in a folder and below it.
 
-    What names a process counts as left when that process is gone; what names none when it is an hour old.
+    What names a process counts as left when that process is gone; a campaign's result, whose name ends in 32
+    hexadecimal digits because its worker may be on another host, when it is an hour old. All else stays.
     """
     # Unlike `rglob`, `os.walk` passes over a folder that vanishes meanwhile.
     for inside, _, names in os.walk(folder, topdown=False):
@@ -212,9 +214,9 @@ def sweep(folder: str | Path) -> None:
             shutil.rmtree(probe, ignore_errors=True)
 
 
-def _is_left(path: Path, process: str) -> bool:
-    if process.isdigit():
-        return not _runs(int(process))
+def _is_left(path: Path, writer: str) -> bool:
+    if _RESULT.fullmatch(writer) is None:
+        return writer.isdigit() and not _runs(int(writer))
     try:
         return time.time() - path.stat().st_mtime > _OLD_SECONDS
     except FileNotFoundError:
