@@ -16,8 +16,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sidestep.safety.greedy_chase import chase
-from sidestep.safety.sampled_design import (
+from sidestep.safety.certificate.greedy_chase import chase
+from sidestep.safety.certificate.sampled_design import (
     FINE,
     best_design,
     broken_level,
@@ -26,8 +26,8 @@ from sidestep.safety.sampled_design import (
     largest_true,
     spare,
 )
-from sidestep.safety.sampled_game import Design, SampledGame
-from sidestep.safety.shield_check import shield_level
+from sidestep.safety.certificate.sampled_game import Design, SampledGame
+from sidestep.safety.certificate.shield_check import shield_level
 from sidestep.world import load_scenario
 
 PAPER = SampledGame(evader_speed=0.1574, pursuer_speed=0.2, half_axle=0.2, control_period=0.05)

@@ -16,10 +16,10 @@ from typing import Any
 
 import sidestep
 from sidestep.bench.machine import load, machine, versions
-from sidestep.bridges.flight import FlightOptions, Pilot, certificate_of, errors_of, fly
 from sidestep.commands.fly import flight_counts
 from sidestep.learning import load_policy
 from sidestep.learning import train as run_training
+from sidestep.plants.air import FlightOptions, Pilot, certificate_of, errors_of, fly
 from sidestep.world import load_scenario, scenario_to_dict
 
 PURSUERS = ("chauffeur", "nash", "turn-while-driving")

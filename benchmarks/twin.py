@@ -43,7 +43,7 @@ def _scenario(name: str) -> Any:
 
 
 def _options(base: str, noise: float, delay: float) -> Any:
-    from sidestep.bridges.twin import Sensors, TwinOptions
+    from sidestep.plants.ground import Sensors, TwinOptions
 
     sensors = Sensors(
         rate=100.0,
@@ -57,7 +57,7 @@ def _options(base: str, noise: float, delay: float) -> Any:
 
 def verdict(scenario: str, noise: float, delay: float) -> dict[str, Any]:
     """What the certificate says of a cell."""
-    from sidestep.bridges.twin import bounded_errors
+    from sidestep.plants.ground import bounded_errors
     from sidestep.safety import certify
 
     chosen = _scenario(scenario)
@@ -76,9 +76,9 @@ def verdict(scenario: str, noise: float, delay: float) -> dict[str, Any]:
 def run_block(job: Job) -> dict[str, Any]:
     """A block of episodes: (scenario, base, noise, delay, block, episodes, settings) to its counts."""
     scenario, base, noise, delay, block, episodes, settings = job
-    from sidestep.bridges.onboard import Onboard
-    from sidestep.bridges.twin import settings_for, twin_episode
-    from sidestep.safety.budget import BudgetWarning
+    from sidestep.plants.ground import settings_for, twin_episode
+    from sidestep.robot import Onboard
+    from sidestep.safety.barriers.budget import BudgetWarning
 
     begun = time.perf_counter()
     chosen, options = _scenario(scenario), _options(base, noise, delay)

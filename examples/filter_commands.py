@@ -3,7 +3,7 @@
 import math
 
 from sidestep import load_scenario
-from sidestep.bridges.onboard import Onboard, OnboardSettings
+from sidestep.robot import Onboard, OnboardSettings
 from sidestep.safety import Budget
 
 scenario = load_scenario("paper", capture_distance=0.15)

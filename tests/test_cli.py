@@ -18,7 +18,7 @@ from sidestep.commands.falsify import Falsify
 from sidestep.commands.reproduce import Reproduce
 from sidestep.commands.train import Train
 from sidestep.learning import train
-from sidestep.safety.catalogue import SHIELDS
+from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.trials import load_survey
 from sidestep.trials.campaign import load_campaign, run_task
 from sidestep.trials.campaign.jobs import figure_names, flat

@@ -13,8 +13,8 @@ from sidestep.cli import main
 from sidestep.commands.evaluate import evaluation_table
 from sidestep.commands.train import training_table
 from sidestep.learning import make_options
+from sidestep.loop import rollout
 from sidestep.pursuit import Pursuer
-from sidestep.trials import rollout
 
 SMALL = load_scenario("paper", obstacle_count=0, episode_steps=20)
 SEEDS = (-1, 2**32, 99999999999999999999)

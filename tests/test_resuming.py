@@ -13,9 +13,9 @@ import pytest
 from sidestep.cli import main
 from sidestep.commands.falsify import SearchBar
 from sidestep.learning import resume_settings, train
-from sidestep.learning.checkpoints import list_checkpoints
-from sidestep.learning.records import read_metrics, read_summary
+from sidestep.store.checkpoints import list_checkpoints
 from sidestep.store.lock import hold
+from sidestep.store.runs import read_metrics, read_summary
 from sidestep.trials.reproduction import reproduce, study_settings
 
 LEARNER = ["hidden=[8, 8]", "batch_size=8", "warmup_decisions=10", "replay_capacity=12"]
@@ -170,7 +170,7 @@ def test_interrupt_before_anything_is_written_advises_nothing_that_is_not_there(
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    for module in ("sidestep.learning.records", "sidestep.trials.falsification.search"):
+    for module in ("sidestep.store.runs", "sidestep.trials.falsification.search"):
         monkeypatch.setattr(sys.modules[module], "create_run", interrupt)
     assert main([*BEGIN[name], "--out", str(tmp_path / "run")]) == 130
     assert "Interrupted before anything was written" in capsys.readouterr().out

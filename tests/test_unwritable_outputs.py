@@ -6,7 +6,8 @@ import os
 import pytest
 
 from sidestep.cli import main
-from sidestep.learning import make_options, records, resume_settings, train
+from sidestep.learning import make_options, resume_settings, train
+from sidestep.store import runs as records
 from sidestep.store.files import OutputError
 from sidestep.world import load_scenario
 
@@ -112,7 +113,7 @@ def test_first_error_is_said_where_the_last_checkpoint_fails_too(tmp_path, disk)
 def test_log_that_does_not_fit_leaves_no_torso(tmp_path, disk, monkeypatch):
     pytest.importorskip("mcap")
     from sidestep.bridges.logs import save_log
-    from sidestep.trials import rollout
+    from sidestep.loop import rollout
 
     scenario = load_scenario("paper", obstacle_count=0, episode_steps=10)
     trajectory = rollout(scenario, "goal-seeking", "none", "still", 0)

@@ -21,9 +21,9 @@ _PUBLIC = {
     "load_policy": "learning",
     "train": "learning",
     "Evaluation": "trials",
-    "Trajectory": "trials",
+    "Trajectory": "loop",
     "evaluate": "trials",
-    "rollout": "trials",
+    "rollout": "loop",
     "Events": "world",
     "Scenario": "world",
     "ScenarioError": "world",
@@ -33,7 +33,7 @@ _PUBLIC = {
     "observe": "world",
     "robot_fields": "world",
 }
-_ROOMS = ("world", "pursuit", "safety", "learning", "trials", "views")
+_ROOMS = ("world", "pursuit", "safety", "loop", "learning", "trials", "views")
 
 __all__ = ["__version__", *_PUBLIC]
 
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from sidestep.learning import LearnedPolicy as LearnedPolicy
     from sidestep.learning import load_policy as load_policy
     from sidestep.learning import train as train
+    from sidestep.loop import Trajectory as Trajectory
+    from sidestep.loop import rollout as rollout
     from sidestep.pursuit import CaptureGame as CaptureGame
     from sidestep.pursuit import Pursuer as Pursuer
     from sidestep.pursuit import make_pursuer as make_pursuer
@@ -48,9 +50,7 @@ if TYPE_CHECKING:
     from sidestep.safety import ShieldResult as ShieldResult
     from sidestep.safety import make_shield as make_shield
     from sidestep.trials import Evaluation as Evaluation
-    from sidestep.trials import Trajectory as Trajectory
     from sidestep.trials import evaluate as evaluate
-    from sidestep.trials import rollout as rollout
     from sidestep.world import Events as Events
     from sidestep.world import Scenario as Scenario
     from sidestep.world import ScenarioError as ScenarioError

@@ -16,7 +16,7 @@ from sidestep.bench.figures import draw_all
 from sidestep.bench.peers import MissingPeer, peer
 from sidestep.bench.sections import SECTIONS, section
 from sidestep.cli import main
-from sidestep.safety.filter import project
+from sidestep.safety.filter.projection import project
 
 
 @pytest.mark.parametrize("rows", [2, 8])

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from sidestep.bridges.export import export_jax, export_onnx
-from sidestep.learning.control_step import decide
 from sidestep.learning.networks import Actor
 from sidestep.learning.policy import LearnedPolicy, write_policy
-from sidestep.learning.records import create_run
+from sidestep.loop.step import decide
 from sidestep.safety import Budget, GameShield, Status, make_shield
+from sidestep.store.runs import create_run
 from sidestep.world import World, load_scenario, observation_size, observe
 from sidestep.world.loading import scenario_to_dict
 

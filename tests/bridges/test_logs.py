@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sidestep.loop import Trajectory
 from sidestep.safety import Status
-from sidestep.trials import Trajectory
 from sidestep.world import Events, World, load_scenario
 
 pytest.importorskip("mcap_ros2")
@@ -259,7 +259,7 @@ def test_evaluate_logs_the_episode_that_was_asked_for(tmp_path, capsys, monkeypa
     import sidestep.trials
     from sidestep.cli import main
     from sidestep.commands import evaluate
-    from sidestep.trials import episode_key, rollout
+    from sidestep.loop import episode_key, rollout
 
     # What is measured is tested elsewhere, and would take longest here.
     closest = {"min_pursuer_clearance": np.array([0.2, 0.3, 0.4]), "min_obstacle_clearance": [9.0, 0.1, 9.0]}

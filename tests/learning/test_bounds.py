@@ -12,7 +12,7 @@ from sidestep.learning.networks import Actor, TwinCritic
 from sidestep.learning.replay import mirror_world
 from sidestep.learning.td3 import actor_loss
 from sidestep.safety import GameShield, as_shield
-from sidestep.safety.joint import JointShield
+from sidestep.safety.shields.joint import JointShield
 from sidestep.world import World, load_scenario, observation_size, observe
 
 KEY = jax.random.key(0)

@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 
 from sidestep.learning import load_policy, make_options, options_to_dict, resume_settings, train
-from sidestep.learning.checkpoints import (
+from sidestep.learning.training import start
+from sidestep.safety import as_shield
+from sidestep.store.checkpoints import (
     CheckpointError,
     list_checkpoints,
     read_checkpoint,
@@ -25,11 +27,9 @@ from sidestep.learning.checkpoints import (
     write_arrays,
     write_checkpoint,
 )
-from sidestep.learning.records import RunError, read_metrics, read_summary
-from sidestep.learning.training import start
-from sidestep.safety import as_shield
 from sidestep.store.damage import DamageWarning
 from sidestep.store.files import read_json
+from sidestep.store.runs import RunError, read_metrics, read_summary
 from sidestep.world import scenario_to_dict
 
 

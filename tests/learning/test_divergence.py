@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import real
-from sidestep.learning.checkpoints import CheckpointError, list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.divergence import Diverged, broken_networks, divergence
-from sidestep.learning.records import read_metrics, read_summary
 from sidestep.learning.td3 import Losses
 from sidestep.learning.training import Report, Tally, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
+from sidestep.store.checkpoints import CheckpointError, list_checkpoints, read_checkpoint, write_checkpoint
+from sidestep.store.runs import read_metrics, read_summary
 
 WILD = 1e30
 """A learning rate that no network survives."""

@@ -11,11 +11,11 @@ import pytest
 
 from sidestep._arrays import real
 from sidestep.learning import load_policy
-from sidestep.learning.checkpoints import CheckpointError
 from sidestep.learning.curves import Curves
 from sidestep.learning.networks import Actor
 from sidestep.learning.policy import LearnedPolicy, write_policy
-from sidestep.learning.records import RunError, create_run, read_metrics
+from sidestep.store.checkpoints import CheckpointError
+from sidestep.store.runs import RunError, create_run, read_metrics
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import real
-from sidestep.learning.control_step import decide
-from sidestep.learning.records import OUTCOMES
 from sidestep.learning.replay import Replay, Transition, mirror_world, reward_along, sample
 from sidestep.learning.training import run_chunk, start
+from sidestep.loop.step import decide
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
-from sidestep.safety.status import Status
+from sidestep.safety.filter.status import Status
+from sidestep.store.runs import OUTCOMES
 from sidestep.world import (
     EvaderModel,
     EvaderState,

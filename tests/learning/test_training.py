@@ -10,12 +10,12 @@ import pytest
 
 from sidestep._arrays import real
 from sidestep.learning.bounds import on_disc
-from sidestep.learning.records import CONVERGENCE_WINDOW
 from sidestep.learning.replay import sample
 from sidestep.learning.td3 import update
 from sidestep.learning.training import _learn, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
+from sidestep.store.runs import CONVERGENCE_WINDOW
 from sidestep.world import observe
 
 
@@ -136,7 +136,7 @@ class Turned(eqx.Module):
         return ()
 
     def __call__(self, world, nominal, memory):
-        from sidestep.safety.shields import ShieldResult
+        from sidestep.safety.shields.shield import ShieldResult
 
         result = ShieldResult(
             action=half_turned(world, nominal),

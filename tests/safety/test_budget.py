@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.learning.control_step import outcome_of
+from sidestep.loop.step import outcome_of
 from sidestep.pursuit import CaptureGame, make_pursuer
 from sidestep.safety import Budget, BudgetWarning, GameShield, JointShield, certify, make_shield
 from sidestep.world import World, load_scenario

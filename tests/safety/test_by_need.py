@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.safety.by_need import by_need
+from sidestep.safety.shields.by_need import by_need
 
 
 def _work(place, pair):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import real
+from sidestep.loop.keys import episode_key, start_and_pursuit
 from sidestep.pursuit import make_pursuer, pursue
 from sidestep.safety import Budget, GameShield, JointShield, PursuitBarrier, Status, make_shield
-from sidestep.safety.look_ahead import STRETCHES, WISHES, imagine, ramp, stretch, wish
-from sidestep.trials.keys import episode_key, start_and_pursuit
+from sidestep.safety.shields.look_ahead import STRETCHES, WISHES, imagine, ramp, stretch, wish
 from sidestep.world import World, load_scenario
 
 # Of the first 300 random starts from key 7, some in which `game` collides while heading for the target.

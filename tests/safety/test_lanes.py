@@ -8,7 +8,7 @@ import pytest
 
 from sidestep.pursuit import PURSUERS, make_pursuer, pursue
 from sidestep.safety import GameShield, Status, project
-from sidestep.safety.filter import project_known
+from sidestep.safety.filter.projection import project_known
 from sidestep.world import load_scenario
 
 LANES = (3, 5)

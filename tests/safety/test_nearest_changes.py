@@ -5,8 +5,8 @@ import json
 import pytest
 
 from sidestep.cli import main
-from sidestep.safety.certificate import certify, clearance_of
-from sidestep.safety.nearest_changes import (
+from sidestep.safety.certificate.certificate import certify, clearance_of
+from sidestep.safety.certificate.nearest_changes import (
     MINE,
     PARAMETERS,
     WHOSE,
@@ -14,8 +14,8 @@ from sidestep.safety.nearest_changes import (
     nearest_changes,
     nearest_pairs,
 )
-from sidestep.safety.sampled_game import SampledGame
-from sidestep.safety.situation import Situation
+from sidestep.safety.certificate.sampled_game import SampledGame
+from sidestep.safety.certificate.situation import Situation
 from sidestep.world import load_scenario
 
 ALL = tuple(WHOSE)

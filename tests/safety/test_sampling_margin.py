@@ -8,7 +8,7 @@ import pytest
 
 from sidestep.pursuit import CaptureGame, make_pursuer, pursue
 from sidestep.safety import GameShield, PursuitBarrier, Status
-from sidestep.safety.sampling_margin import TOUCH, guarded, sampling_margin
+from sidestep.safety.barriers.sampling_margin import TOUCH, guarded, sampling_margin
 from sidestep.world import World, load_scenario
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.world import Events, World
 
 EVADER_SPEED, PURSUER_SPEED, PERIOD, REACH = 0.1574, 0.2, 0.05, 0.2

@@ -12,8 +12,8 @@ import pytest
 from sidestep.cli import main
 from sidestep.learning import LearnedPolicy
 from sidestep.learning.networks import Actor
-from sidestep.learning.records import read_metrics
 from sidestep.safety import PaperShield, make_shield
+from sidestep.store.runs import read_metrics
 from sidestep.trials.falsification import (
     CounterexampleError,
     Plan,

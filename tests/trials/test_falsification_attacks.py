@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.learning.control_step import RUNNING
+from sidestep.loop.step import RUNNING
 from sidestep.pursuit import pursue
 from sidestep.safety import make_shield
-from sidestep.safety.sampling_margin import sampling_margin
+from sidestep.safety.barriers.sampling_margin import sampling_margin
 from sidestep.trials.falsification.attackers import (
     Herder,
     Script,

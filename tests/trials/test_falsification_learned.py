@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.learning.checkpoints import read_named
-from sidestep.learning.control_step import RUNNING
 from sidestep.learning.td3 import TD3
+from sidestep.loop.step import RUNNING
 from sidestep.safety import make_shield
+from sidestep.store.checkpoints import read_named
 from sidestep.trials.falsification import Plan, falsify
 from sidestep.trials.falsification.chases import Target
 from sidestep.trials.falsification.learned import OBSERVATIONS, Lessons, lesson, look, new_pupil

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import whole_number
-from sidestep.learning.records import OUTCOMES
-from sidestep.trials import Evaluation, crew, episode_key, evaluate, monte_carlo, rollout
+from sidestep.loop import episode_key, rollout
+from sidestep.store.runs import OUTCOMES
+from sidestep.trials import Evaluation, crew, evaluate, monte_carlo
 from sidestep.world import goal_seeking, load_scenario
 
 # Crowded and short, so that every outcome occurs.

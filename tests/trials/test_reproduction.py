@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sidestep.learning import make_options
-from sidestep.learning.records import RunError
+from sidestep.store.runs import RunError
 from sidestep.trials.reproduction import reproduce, test_scene_of
 from sidestep.world import load_scenario
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.learning.records import OUTCOMES, RunError
 from sidestep.safety import ShieldResult, Status
+from sidestep.store.runs import OUTCOMES, RunError
 from sidestep.trials import Evaluation, InterventionMap, load_survey, save_survey, take_survey
 from sidestep.trials.intervention_map import CELLS, add_periods, map_reach, no_periods
 from sidestep.trials.survey import worst_numbers

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image, ImageSequence
 
 from sidestep.cli import main
-from sidestep.safety.barriers import ObstacleBarrier
-from sidestep.safety.pursuit_barrier import PursuitBarrier
-from sidestep.trials import save_trajectory
+from sidestep.loop import save_trajectory
+from sidestep.safety.barriers.barrier import ObstacleBarrier
+from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
 from sidestep.views import VideoError, animate
 from sidestep.views.motion import Motion, nearest_pursuers
 from sidestep.views.outlines import LevelOutlines

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from sidestep.cli import main
-from sidestep.trials import load_episode
+from sidestep.loop import load_episode
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import PlayError, listen, make_server
 from sidestep.views.play.visitor import Allowance, Outbox

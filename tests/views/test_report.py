@@ -8,9 +8,10 @@ from html.parser import HTMLParser
 
 import pytest
 
-from sidestep.learning.records import RunError, append_metrics, create_run
+from sidestep.loop import save_trajectory
 from sidestep.store.files import write_json
-from sidestep.trials import save_trajectory, wilson_interval
+from sidestep.store.runs import RunError, append_metrics, create_run
+from sidestep.trials import wilson_interval
 from sidestep.views import load_run, write_report
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import sidestep
+from sidestep.loop import rollout
 from sidestep.pursuit import CaptureGame, make_pursuer, pursue
 from sidestep.safety import covered
-from sidestep.trials import rollout
 from sidestep.world import Aircraft, EvaderState, Quadrotor, ScenarioError, load_scenario, scenario_to_dict
 from sidestep.world.robots import body_velocity, wheels_from_body
 

@@ -28,7 +28,7 @@ _REHEARSALS = 3
 
 
 class OnboardNode(Node, abc.ABC):
-    """Poses in, decisions by `sidestep.bridges.onboard.Onboard`, commands out.
+    """Poses in, decisions by `sidestep.robot.Onboard`, commands out.
 
     A concrete node says in `own_parameters` what it needs besides, makes its decision core in
     `make_onboard`, and hears what else there is from `listen` on.

@@ -115,13 +115,13 @@ class PlainPhysics(Physics):
 
 @final
 class MujocoPhysics(Physics):
-    """`sidestep.bridges.twin`: bodies with motors and friction, and sensors with noise and delay.
+    """`sidestep.plants.ground`: bodies with motors and friction, and sensors with noise and delay.
 
     Its evader's base keeps its own heading: it does not heed a turn rate.
     """
 
     def __init__(self, scenario: Any, sensors: str, base: str, seed: int):
-        from sidestep.bridges.twin import Twin, TwinError, TwinOptions, make_sensors
+        from sidestep.plants.ground import Twin, TwinError, TwinOptions, make_sensors
 
         self._scenario = scenario
         try:

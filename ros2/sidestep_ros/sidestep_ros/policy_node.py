@@ -32,7 +32,7 @@ class PolicyNode(OnboardNode):
         self._accepted = self.create_publisher(PoseStamped, "~/target", quality.LATCHED)
 
     def make_onboard(self, settings: Any) -> Any:
-        from sidestep.bridges.onboard import Onboard
+        from sidestep.robot import Onboard
 
         policy = self.values["policy"]
         if policy != "goal-seeking" and not Path(policy).is_dir():

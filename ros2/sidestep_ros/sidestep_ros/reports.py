@@ -57,7 +57,7 @@ class Complaints:
 
 
 def decision_values(decision: Any, names: tuple[str, ...]) -> dict[str, object]:
-    """The values of a decision (`sidestep.bridges.onboard.Decision`), with `names` of the statuses."""
+    """The values of a decision (`sidestep.robot.Decision`), with `names` of the statuses."""
     return {
         "status": names[int(decision.status)],
         "level": decision.level,

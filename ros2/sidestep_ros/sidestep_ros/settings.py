@@ -44,7 +44,7 @@ def make_scenario(values: dict[str, Any]) -> Any:
 
 def make_onboard_settings(values: dict[str, Any], scenario: Any) -> Any:
     """`OnboardSettings` from the parameters. **Raises** `ConfigurationError` for those that cannot be."""
-    from sidestep.bridges.onboard import OnboardSettings
+    from sidestep.robot import OnboardSettings
     from sidestep.safety import Budget
 
     budget = {

@@ -22,7 +22,7 @@ class ShieldNode(OnboardNode):
         self._turning = (-math.inf, 0.0)
 
     def make_onboard(self, settings: Any) -> Any:
-        from sidestep.bridges.onboard import Onboard
+        from sidestep.robot import Onboard
 
         return Onboard(self.scenario, shield=self.values["shield"], policy=None, settings=settings)
 

@@ -175,7 +175,7 @@ def _ours(given: Problems) -> Side:
     import jax
     import jax.numpy as jnp
 
-    from sidestep.safety.filter import project
+    from sidestep.safety.filter.projection import project
 
     solve = jax.jit(project)
     limit = jnp.asarray(LIMIT, jnp.float32)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.learning.control_step import control_step
+from sidestep.loop.step import control_step
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield, start_in_lanes
 from sidestep.world import Scenario, World, load_scenario, to_velocity

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.safety.certificate import Certificate
-    from sidestep.safety.nearest_changes import Change
-    from sidestep.safety.situation import Situation
+    from sidestep.safety.certificate.certificate import Certificate
+    from sidestep.safety.certificate.nearest_changes import Change
+    from sidestep.safety.certificate.situation import Situation
     from sidestep.world import KnownRobot
 
 

@@ -129,7 +129,7 @@ def scenario_of_run(
 ) -> tuple[Scenario, dict[str, Any]]:
     """The scenario to use a policy in, and what its folder says of the training: `scenario` if one is named,
     else the folder's own, else paper."""
-    from sidestep.learning.records import open_run
+    from sidestep.store.runs import open_run
     from sidestep.world import load_scenario
 
     changes = scenario_overrides(overrides)

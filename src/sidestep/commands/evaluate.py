@@ -52,8 +52,8 @@ class Evaluate:
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
     from sidestep._arrays import seed_number, whole_number
+    from sidestep.loop import episode_key, rollout
     from sidestep.store.outputs import try_outputs
-    from sidestep.trials import episode_key, rollout
     from sidestep.trials import evaluate as run_evaluation
 
     check_options(command.film)
@@ -109,7 +109,7 @@ def _write_log(
 ) -> None:
     """One of the episodes measured, run again and logged."""
     from sidestep.bridges.logs import save_log
-    from sidestep.trials import episode_key, rollout
+    from sidestep.loop import episode_key, rollout
 
     assert command.log is not None
     key = episode_key(command.seed, command.log_episode)

@@ -89,7 +89,7 @@ def run(command: Falsify, console: Console) -> int:
     whole_number("batch", command.batch), whole_number("most", command.most)
     if command.replay is not None:
         return _replay(command, console)
-    from sidestep.learning.records import writing
+    from sidestep.store.runs import writing
 
     with going_on(console, out, *resume_words("falsify", out, command.json)):
         with writing(out, resume=command.resume):
@@ -147,7 +147,7 @@ def _search(command: Falsify, out: Path, console: Console) -> Falsification:
 
 def _scenario(command: Falsify, stored: Any) -> Any:
     """As `scenario_from`, but a new search without one takes that of the policy's run."""
-    from sidestep.learning.records import open_run
+    from sidestep.store.runs import open_run
     from sidestep.world import load_scenario
 
     if stored is None and command.scenario is None and (Path(command.policy) / "config.json").is_file():

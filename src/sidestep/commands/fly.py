@@ -31,7 +31,7 @@ from sidestep.commands.physics import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.bridges.flight import FlightEpisode
+    from sidestep.plants.air import FlightEpisode
 
 
 _NEAR = 2.0
@@ -87,8 +87,8 @@ def run(command: Fly, console: Console) -> int:
 
 
 def _run(command: Fly, console: Console) -> int:
-    from sidestep.bridges.flight import ROOM_SENSORS, FlightOptions, Pilot, certificate_of, fly, write_video
-    from sidestep.bridges.twin import changed_sensors
+    from sidestep.plants.air import ROOM_SENSORS, FlightOptions, Pilot, certificate_of, fly, write_video
+    from sidestep.plants.ground import changed_sensors
 
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     options = FlightOptions(
@@ -146,7 +146,7 @@ def flight_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _promised(options: Any, certificate: Any) -> dict[str, Any]:
-    from sidestep.bridges.flight import errors_of
+    from sidestep.plants.air import errors_of
 
     return {
         "budget": errors_of(options),

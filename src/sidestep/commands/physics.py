@@ -14,9 +14,9 @@ from sidestep.commands.common import CountBar, stood_still
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.bridges.twin.record import PhysicsEpisode
     from sidestep.commands.fly import Fly
     from sidestep.commands.twin import Twin
+    from sidestep.plants.ground.record import PhysicsEpisode
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def play_seeds(
     """
     import warnings
 
-    from sidestep.safety.budget import BudgetWarning
+    from sidestep.safety.barriers.budget import BudgetWarning
 
     figures: list[dict[str, Any]] = []
     first, interrupted = None, False
@@ -139,7 +139,7 @@ def draw_beside_simulation(
     **looks: Any,
 ) -> None:
     """`stem`.npz, a recording of the episode, and `stem`.png and .pdf, the plain simulation beside it."""
-    from sidestep.trials import rollout, save_trajectory
+    from sidestep.loop import rollout, save_trajectory
     from sidestep.views import twin_figure
 
     scenario = episode.scenario
@@ -156,7 +156,7 @@ def about_of(command: Twin | Fly, source: str) -> dict[str, Any]:
 
 def outcome_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
     """Counts over episodes with 95 % bounds of the shares, and the least distances (m); None without one."""
-    from sidestep.learning.records import OUTCOMES
+    from sidestep.store.runs import OUTCOMES
     from sidestep.trials import wilson_interval
 
     counts: dict[str, Any] = {"episodes": len(figures)}

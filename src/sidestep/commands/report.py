@@ -34,9 +34,9 @@ class Report:
 
 def run(command: Report, console: Console) -> int:
     """Run `sidestep report`; returns the exit status."""
-    from sidestep.learning.records import held_if_run
     from sidestep.store.files import OutputError
     from sidestep.store.outputs import try_outputs
+    from sidestep.store.runs import held_if_run
     from sidestep.views import write_report
 
     if not command.runs:
@@ -68,8 +68,8 @@ def run(command: Report, console: Console) -> int:
 
 def _run_folders(paths: tuple[Path, ...], console: Console) -> list[Path]:
     """The run folders, those of a reproduction one by one. A run counts once."""
-    from sidestep.learning.records import RunError
     from sidestep.store.files import read_json
+    from sidestep.store.runs import RunError
 
     folders: list[Path] = []
     for path in paths:
@@ -149,8 +149,8 @@ def _read_episode(path: Path) -> tuple[Any, Any, Mapping[str, Any], Sequence[str
 
         log = load_log(path)
         return log.scenario, log.trajectory, log.about, log.rebuilt
-    from sidestep.learning.records import open_run
-    from sidestep.trials import load_episode
+    from sidestep.loop import load_episode
+    from sidestep.store.runs import open_run
     from sidestep.world import load_scenario
 
     if not path.is_file():

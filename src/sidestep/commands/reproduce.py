@@ -63,8 +63,8 @@ class Reproduce:
 
 def run(command: Reproduce, console: Console) -> int:
     """Run `sidestep reproduce`; returns the exit status."""
-    from sidestep.learning.records import writing
     from sidestep.store.outputs import try_outputs
+    from sidestep.store.runs import writing
 
     try_outputs(files=[command.json], folders=[command.out])
     resume = command.resume and (command.out / "config.json").is_file()
@@ -76,8 +76,8 @@ def run(command: Reproduce, console: Console) -> int:
 
 def _study(command: Reproduce, resume: bool, console: Console) -> None:
     """The study, its tables and its report."""
-    from sidestep.learning.records import read_summary
     from sidestep.store.files import write_bytes
+    from sidestep.store.runs import read_summary
     from sidestep.trials.reproduction import reproduce as run_study
     from sidestep.trials.reproduction import study_settings
     from sidestep.views import comparison_sections, markdown_tables, write_report

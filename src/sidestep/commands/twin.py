@@ -31,7 +31,7 @@ from sidestep.commands.physics import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.bridges.twin import TwinEpisode
+    from sidestep.plants.ground import TwinEpisode
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def run(command: Twin, console: Console) -> int:
 def _run(command: Twin, console: Console) -> int:
     from dataclasses import replace
 
-    from sidestep.bridges.onboard import Onboard
-    from sidestep.bridges.twin import TwinOptions, make_sensors, settings_for, twin_episode, write_video
+    from sidestep.plants.ground import TwinOptions, make_sensors, settings_for, twin_episode, write_video
+    from sidestep.robot import Onboard
     from sidestep.safety import Budget
 
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)

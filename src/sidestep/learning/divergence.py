@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from sidestep.learning.checkpoints import CheckpointError
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.td3 import Learner
 from sidestep.learning.training import Report
+from sidestep.store.checkpoints import CheckpointError
 
 _PARTS = {
     "actor": "weights of the actor",

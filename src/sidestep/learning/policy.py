@@ -10,9 +10,9 @@ import jax
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, real
-from sidestep.learning.checkpoints import read_arrays, read_named, write_arrays
 from sidestep.learning.networks import Actor
-from sidestep.learning.records import RunError, open_run
+from sidestep.store.checkpoints import read_arrays, read_named, write_arrays
+from sidestep.store.runs import RunError, open_run
 
 _FILE = "policy.npz"
 

@@ -16,8 +16,6 @@ import numpy as np
 import sidestep
 from sidestep import _interrupts
 from sidestep._arrays import seed_number, whole_number
-from sidestep.learning import records
-from sidestep.learning.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.learning.curves import Curves
 from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
@@ -25,6 +23,8 @@ from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
 from sidestep.learning.training import Report, TrainState, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
+from sidestep.store import runs as records
+from sidestep.store.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.store.files import OutputError, json_safe, write_json
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 

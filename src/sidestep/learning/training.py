@@ -11,12 +11,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, Flag, Scalar, real
 from sidestep.learning.bounds import on_disc, through_shield
-from sidestep.learning.control_step import RUNNING, control_step, nominal_velocity, outcome_of
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Learner, Losses, update
+from sidestep.loop.step import RUNNING, control_step, nominal_velocity, outcome_of
 from sidestep.pursuit import without_answer
-from sidestep.safety.status import Status
+from sidestep.safety.filter.status import Status
 from sidestep.world import Scenario, World, observation_size, observe
 
 

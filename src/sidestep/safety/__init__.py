@@ -1,34 +1,49 @@
 """What keeps the evader free: the exact filter, barriers and their rows, shields, the certificate."""
 
-from sidestep.safety.adapted import AdaptedShield, covered, of_control_point
-from sidestep.safety.barrier_shield import BarrierShield, shield_of
 from sidestep.safety.barriers import (
     Barrier,
+    BarrierProbe,
     BarrierRows,
+    BarrierWarning,
+    Budget,
+    BudgetWarning,
+    DistanceValue,
+    FrameBarrier,
     ObstacleBarrier,
+    PursuitBarrier,
     RangeBarrier,
     compose,
+    grid_barrier,
+    probe_barrier,
+    solve_distance,
 )
-from sidestep.safety.budget import Budget, BudgetWarning
-from sidestep.safety.catalogue import BARRIERS, SHIELDS, as_shield, make_shield
 from sidestep.safety.certificate import Certificate, certify
-from sidestep.safety.distance_game import DistanceValue, grid_barrier, solve_distance
-from sidestep.safety.filter import Projection, project, tolerance
-from sidestep.safety.frame_barrier import FrameBarrier
-from sidestep.safety.joint import JointShield
-from sidestep.safety.probe import BarrierProbe, BarrierWarning, probe_barrier
-from sidestep.safety.pursuit_barrier import PursuitBarrier
+from sidestep.safety.filter import (
+    Projection,
+    Status,
+    project,
+    tolerance,
+)
 from sidestep.safety.shields import (
+    BARRIERS,
+    SHIELDS,
+    AdaptedShield,
+    BarrierShield,
     GameMemory,
     GameShield,
+    JointShield,
     NoShield,
     PaperShield,
     Shield,
     ShieldResult,
+    as_shield,
+    covered,
     filter_in_lanes,
+    make_shield,
+    of_control_point,
+    shield_of,
     start_in_lanes,
 )
-from sidestep.safety.status import Status
 
 __all__ = [
     "BARRIERS",

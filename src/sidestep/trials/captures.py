@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from sidestep.loop.keys import episode_key
+from sidestep.loop.rollout import Trajectory, rollout
 from sidestep.trials.evaluation import Evaluation
-from sidestep.trials.keys import episode_key
-from sidestep.trials.rollout import Trajectory, rollout
 from sidestep.world import Scenario
 
 CAUSES = ("reversing", "head-on", "other")

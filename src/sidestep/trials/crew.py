@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Count, select
-from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.loop.keys import episode_key, start_and_pursuit
+from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.pursuit import without_answer
 from sidestep.safety import Status, start_in_lanes
 from sidestep.trials.intervention_map import add_periods, no_periods
-from sidestep.trials.keys import episode_key, start_and_pursuit
 from sidestep.world import Scenario, World
 
 _CHUNK_STEPS = 200

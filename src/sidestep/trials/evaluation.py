@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.learning.records import OUTCOMES
 from sidestep.store.files import json_safe
+from sidestep.store.runs import OUTCOMES
 from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.statistics import wilson_interval
 

@@ -11,15 +11,15 @@ from jaxtyping import PRNGKeyArray
 
 from sidestep._arrays import whole_number
 from sidestep._threads import side_by_side, useful_threads
-from sidestep.learning.control_step import decision_steps_of
+from sidestep.loop.keys import as_key
+from sidestep.loop.policies import HostPolicy, as_policy
+from sidestep.loop.step import decision_steps_of
 from sidestep.pursuit import as_pursuer
 from sidestep.pursuit.foreign import runs_on_host
 from sidestep.safety import Shield, as_shield
 from sidestep.trials.crew import COLLECTED, Crew, Trial
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.intervention_map import InterventionMap, map_reach
-from sidestep.trials.keys import as_key
-from sidestep.trials.policies import HostPolicy, as_policy
 from sidestep.world import Scenario
 
 _WHOLE = 16

@@ -12,15 +12,16 @@ import numpy as np
 
 import sidestep
 from sidestep._arrays import seed_number, whole_number
-from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, records, train
+from sidestep.learning import TrainingOptions, load_policy, make_options, options_to_dict, train
+from sidestep.loop.keys import evaluation_seed
+from sidestep.loop.policies import GOAL_SEEKING
+from sidestep.loop.rollout import Trajectory, load_trajectory, rollout, save_trajectory
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import SHIELDS, Status, make_shield
+from sidestep.store import runs as records
 from sidestep.store.files import json_safe, read_json, write_json
 from sidestep.trials.captures import examine_captures
-from sidestep.trials.keys import evaluation_seed
 from sidestep.trials.monte_carlo import evaluate
-from sidestep.trials.policies import GOAL_SEEKING
-from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
 from sidestep.trials.survey import save_survey, take_survey
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from sidestep.learning import load_policy
-from sidestep.learning.records import OUTCOMES, RunError, held_if_run, open_run
+from sidestep.loop.keys import episode_key, evaluation_seed
+from sidestep.loop.rollout import Trajectory, load_trajectory, rollout, save_trajectory
 from sidestep.store.files import read_json, write_bytes
+from sidestep.store.runs import OUTCOMES, RunError, held_if_run, open_run
 from sidestep.trials.evaluation import Evaluation
 from sidestep.trials.intervention_map import InterventionMap
-from sidestep.trials.keys import episode_key, evaluation_seed
 from sidestep.trials.monte_carlo import evaluate
-from sidestep.trials.rollout import Trajectory, load_trajectory, rollout, save_trajectory
 from sidestep.world import Scenario, load_scenario
 
 EPISODES_FILE = "episodes.npz"

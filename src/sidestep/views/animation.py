@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.views.stage import LEVELS, Stage
 from sidestep.views.video_files import VideoError, check_video, write_video_file
 from sidestep.world import Scenario

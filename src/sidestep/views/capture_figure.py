@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
-from sidestep.trials import Capture, Trajectory, explain_capture
+from sidestep.loop import Trajectory
+from sidestep.trials import Capture, explain_capture
 from sidestep.views.scene import (
     draw_capture_set,
     draw_pursuer,

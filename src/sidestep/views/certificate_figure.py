@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
-from sidestep.safety.certificate import Certificate
+from sidestep.safety.certificate.certificate import Certificate
 from sidestep.views.scene import draw_pursuer, set_limits
 from sidestep.views.style import (
     GREEN,

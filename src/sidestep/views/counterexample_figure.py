@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.views.motion import relative
 from sidestep.views.outlines import pursuer_heights
 from sidestep.views.scene import (

@@ -10,9 +10,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import sidestep
+from sidestep.loop import Trajectory
 from sidestep.safety import Status
 from sidestep.store.files import write_bytes
-from sidestep.trials import Trajectory
 from sidestep.views.html import data_uri, shown_number, shown_value
 from sidestep.views.style import OUTCOME_WORDS
 from sidestep.views.trajectory_figures import trajectory_figure

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.world import Scenario
 
 _Angles = np.ndarray | np.floating

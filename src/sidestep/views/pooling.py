@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sidestep.learning.records import OUTCOMES
+from sidestep.store.runs import OUTCOMES
 from sidestep.trials import wilson_interval
 
 _LEAST = ("min_pursuer_clearance", "min_obstacle_clearance")

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
+from sidestep.loop import Trajectory
 from sidestep.safety import Status
-from sidestep.trials import Trajectory, WorstEpisode
+from sidestep.trials import WorstEpisode
 from sidestep.views.html import shown_number
 from sidestep.views.scene import drawn_half_axle, guarded
 from sidestep.views.style import OUTCOME_WORDS, shield_words

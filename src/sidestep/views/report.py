@@ -12,9 +12,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import sidestep
-from sidestep.learning.records import held_if_run
 from sidestep.pursuit import CaptureGame
 from sidestep.store.files import write_bytes
+from sidestep.store.runs import held_if_run
 from sidestep.views.html import shown_number, shown_value
 from sidestep.views.pooling import pooled_evaluation
 from sidestep.views.report_sections import (

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from sidestep.loop import Trajectory
 from sidestep.safety import Status
-from sidestep.trials import Capture, InterventionMap, Trajectory, explain_capture
+from sidestep.trials import Capture, InterventionMap, explain_capture
 from sidestep.views.capture_figure import capture_figure
 from sidestep.views.clearance_figure import clearance_figure
 from sidestep.views.html import data_uri, shown_number

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.learning.records import converged_episode, stays_converged_from
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
+from sidestep.store.runs import converged_episode, stays_converged_from
 from sidestep.views.html import shown_number
 from sidestep.views.runs import Run
 from sidestep.views.style import OUTCOME_WORDS, shield_words

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sidestep.learning.records import RunError, read_metrics, summarise
-from sidestep.safety.catalogue import SHIELDS
+from sidestep.loop import Trajectory, load_trajectory
+from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.store.files import read_json
-from sidestep.trials import Survey, Trajectory, load_survey, load_trajectory
+from sidestep.store.runs import RunError, read_metrics, summarise
+from sidestep.trials import Survey, load_survey
 from sidestep.world import Scenario, load_scenario
 
 EVALUATION_FILE = "evaluation.json"

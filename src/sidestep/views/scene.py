@@ -17,8 +17,8 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
+from sidestep.loop import Trajectory
 from sidestep.safety import covered, of_control_point
-from sidestep.trials import Trajectory
 from sidestep.views.labels import Label
 from sidestep.views.style import EVADER, FAINT, OBSTACLE, PURSUER, TARGET
 from sidestep.world import Scenario, World

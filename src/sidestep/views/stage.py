@@ -16,7 +16,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.views.motion import Instant, Motion
 from sidestep.views.moving_panel import NOMINAL_DASHES, MovingPanel
 from sidestep.views.outlines import PURSUIT_SHIELDS

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from sidestep.learning.records import (
+from sidestep.store.runs import (
     CONVERGENCE_RETURN,
     CONVERGENCE_WINDOW,
     converged_episode,

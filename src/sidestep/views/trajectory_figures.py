@@ -13,8 +13,8 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from sidestep.loop import Trajectory
 from sidestep.safety import Status
-from sidestep.trials import Trajectory
 from sidestep.views.outlines import PURSUIT_SHIELDS, LevelOutlines, draw_barrier_levels
 from sidestep.views.scene import (
     CAPTURE_SET_LOOK,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.views.style import (
     BLUE,
     GREY,

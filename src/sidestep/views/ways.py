@@ -7,7 +7,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.views.motion import Instant, Motion, nearest_pursuers, relative
 from sidestep.views.scene import correction_colours
 from sidestep.views.style import OBSTACLE, PURSUER

@@ -28,7 +28,7 @@ class Quadrotor(EvaderModel):
     acceleration. The control point p + tau v + tau T a moves as told, and is never farther from p than
     tau v_e as long as it has been told no more than v_e (the response from its motion to that difference has
     no overshoot for tau > 4 T). What the airframe lags behind this motion is a position error, see
-    `sidestep.bridges.flight`.
+    `sidestep.plants.air`.
 
     **Raises** `ValueError` for time constants that are not above 0, or tau <= 4 T.
     """

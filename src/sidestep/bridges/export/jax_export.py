@@ -16,7 +16,7 @@ from jax import export
 from sidestep._arrays import real
 from sidestep._packages import needed
 from sidestep.bridges.export.files import facts, write_new
-from sidestep.learning.control_step import decide
+from sidestep.loop.step import decide
 from sidestep.safety import Shield
 from sidestep.world import Scenario, World, observation_size
 

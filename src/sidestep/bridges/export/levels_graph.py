@@ -1,4 +1,4 @@
-"""By how much rows must give way, as a graph: the levels in the disc of `sidestep.safety.least_violation`."""
+"""By how much rows must give way, as a graph: the levels in the disc of `safety.filter.least_violation`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows of the shield `game` as a graph; the barriers themselves are in `sidestep.safety.barriers`.
+"""The rows of the shield `game` as a graph; the barriers themselves are in `safety.barriers.barrier`.
 
 A row n.u >= c is kept as N = -n, which points towards the other robot, and c in units of the evader's speed.
 """
@@ -15,8 +15,8 @@ from sidestep.bridges.export.levels_graph import Row
 from sidestep.bridges.export.scene import Scene, for_each, picks
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import GameShield
-from sidestep.safety.pursuit_barrier import KEEP_SIDE, LOST_SIDE, STEEPER
-from sidestep.safety.sampling_margin import guarded, sampling_margin
+from sidestep.safety.barriers.pursuit_barrier import KEEP_SIDE, LOST_SIDE, STEEPER
+from sidestep.safety.barriers.sampling_margin import guarded, sampling_margin
 
 _SMALLEST = 1e-30
 

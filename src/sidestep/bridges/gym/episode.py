@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from sidestep._arrays import AnyArray, Lanes, lane_by_lane, real, select
 from sidestep.bridges.gym.task import Task
-from sidestep.learning.control_step import control_step, nominal_velocity
+from sidestep.loop.keys import episode_key, start_and_pursuit
+from sidestep.loop.step import control_step, nominal_velocity
 from sidestep.pursuit import without_answer
 from sidestep.safety import start_in_lanes
-from sidestep.trials.keys import episode_key, start_and_pursuit
 from sidestep.world import World, observe, to_action
 from sidestep.world.robots import limit_speed
 

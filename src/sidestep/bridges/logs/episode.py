@@ -16,9 +16,9 @@ import numpy as np
 from sidestep.bridges.logs.messages import heading_of
 from sidestep.bridges.logs.reader import Record, about_of, read_log
 from sidestep.bridges.logs.writer import LogWriter, refuse_existing
+from sidestep.loop import Trajectory
 from sidestep.safety import Status
 from sidestep.store.files import whole_file
-from sidestep.trials import Trajectory
 from sidestep.world import Events, Scenario, World, load_scenario
 from sidestep.world.state import WORLD_FIELDS, worlds_of
 

@@ -210,7 +210,7 @@ class LogWriter:
         self.target(stamp, world.target)
 
     def onboard(self, stamp: float, decision: Any) -> None:
-        """A `Decision` of `sidestep.bridges.onboard`, with the world that it was made from, if there was
+        """A `Decision` of `sidestep.robot`, with the world that it was made from, if there was
         one."""
         if decision.world is not None:
             self.world(stamp, decision.world)

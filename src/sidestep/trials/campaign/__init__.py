@@ -1,10 +1,10 @@
 """Many trials as one: which jobs a file asks for, what each came to, and how they compare."""
 
+from sidestep.store.campaign import Store
 from sidestep.trials.campaign.comparison import Comparison, Group, Pair, compare
 from sidestep.trials.campaign.jobs import Job, Task, run_task
 from sidestep.trials.campaign.plan import Campaign, CampaignError, CompareSettings, load_campaign
 from sidestep.trials.campaign.rows import campaign_rows
-from sidestep.trials.campaign.store import Store
 
 __all__ = [
     "Campaign",

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.learning.records import summarise
 from sidestep.store.files import json_safe
 from sidestep.store.lock import hold
+from sidestep.store.runs import summarise
 
 KINDS = ("evaluate", "train")
 AXES = ("scenario", "shield", "pursuer", "policy", "learner", "seed")
@@ -155,7 +155,7 @@ def _run_evaluate(task: Task, folder: Path | None) -> dict[str, Any]:
 
 def _run_train(task: Task, folder: Path | None) -> dict[str, Any]:
     from sidestep.learning import make_options, train
-    from sidestep.trials.keys import evaluation_seed
+    from sidestep.loop.keys import evaluation_seed
     from sidestep.trials.monte_carlo import evaluate
     from sidestep.world import load_scenario
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sidestep.learning import load_policy, make_options, options_to_dict
+from sidestep.loop.policies import GOAL_SEEKING
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield
 from sidestep.store.files import json_safe
 from sidestep.trials.campaign.jobs import AXES, KINDS, Job, digest_of_file, figure_names
-from sidestep.trials.policies import GOAL_SEEKING
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
 _TABLES = ("name", "kind", "grid", "settings", "scenarios", "learners", "compare")
@@ -263,7 +263,7 @@ class _Reader:
 
     def check_policies(self, choices: Mapping[str, Mapping[Any, Any]]) -> None:
         """Whether every policy was trained on observations of the size that every scenario has."""
-        from sidestep.trials.policies import as_policy
+        from sidestep.loop.policies import as_policy
 
         for policy, (_, file) in choices["policy"].items():
             if file is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from sidestep.store.campaign import Store
 from sidestep.trials.campaign.jobs import Job, flat
-from sidestep.trials.campaign.store import Store
 
 
 def campaign_rows(jobs: Iterable[Job], store: Store) -> list[dict[str, Any]]:

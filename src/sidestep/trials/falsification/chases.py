@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from sidestep._arrays import Count, real
-from sidestep.learning.control_step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.world import Scenario, World
 

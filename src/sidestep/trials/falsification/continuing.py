@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sidestep.learning.records import NOT_BEGUN, RunError, open_run
+from sidestep.store.runs import NOT_BEGUN, RunError, open_run
 from sidestep.trials.falsification.tallies import Plan
 from sidestep.world import load_scenario
 

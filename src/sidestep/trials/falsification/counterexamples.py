@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 import sidestep
-from sidestep.learning.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.learning.policy import LearnedPolicy, load_policy
+from sidestep.loop.policies import GOAL_SEEKING, as_policy
+from sidestep.loop.rollout import Trajectory, rollout
 from sidestep.safety import SHIELDS, Shield, make_shield
+from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.store.files import json_safe
 from sidestep.trials.falsification.attackers import Script
-from sidestep.trials.policies import GOAL_SEEKING, as_policy
-from sidestep.trials.rollout import Trajectory, rollout
 from sidestep.world import Scenario, World, load_scenario, scenario_to_dict
 from sidestep.world.state import WORLD_FIELDS
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Scalar, norm, real
-from sidestep.learning.control_step import RUNNING, decide, decision_steps_of
 from sidestep.learning.td3 import TD3, Batch, Learner, update
+from sidestep.loop.step import RUNNING, decide, decision_steps_of
 from sidestep.pursuit import Pursuer
 from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.trials.falsification.chases import Chase, Target, begin, one_period

@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from sidestep.learning.checkpoints import CheckpointError, read_arrays, write_arrays
+from sidestep.store.checkpoints import CheckpointError, read_arrays, write_arrays
 from sidestep.store.damage import DamageWarning
 
 

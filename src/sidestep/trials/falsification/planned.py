@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arrays import Count, select
-from sidestep.learning.control_step import RUNNING
+from sidestep.loop.step import RUNNING
 from sidestep.trials.falsification.attackers import script
 from sidestep.trials.falsification.chases import Chase, Target, begin, forget, run, shortfall
 from sidestep.trials.falsification.cross_entropy import Optimum, Search, minimise

@@ -15,7 +15,10 @@ import sidestep
 from sidestep import _interrupts
 from sidestep._arrays import seed_number, whole_number
 from sidestep.learning.policy import load_policy
-from sidestep.learning.records import (
+from sidestep.loop.policies import GOAL_SEEKING, as_policy
+from sidestep.safety import Shield, as_shield
+from sidestep.store.files import OutputError, json_safe, make_folder
+from sidestep.store.runs import (
     NOT_BEGUN,
     OUTCOMES,
     RunError,
@@ -29,8 +32,6 @@ from sidestep.learning.records import (
     write_summary,
     writing,
 )
-from sidestep.safety import Shield, as_shield
-from sidestep.store.files import OutputError, json_safe, make_folder
 from sidestep.trials.falsification import learned_state as learned
 from sidestep.trials.falsification.attacks import ATTACKS, Round, make_attack
 from sidestep.trials.falsification.chases import GOALS, Target
@@ -53,7 +54,6 @@ from sidestep.trials.falsification.tallies import (
     clearance_of,
 )
 from sidestep.trials.falsification.verdict import judge
-from sidestep.trials.policies import GOAL_SEEKING, as_policy
 from sidestep.world import Scenario, scenario_to_dict
 
 _WANTED = {"capture": ("captured",), "collision": ("collided",), "both": ("captured", "collided")}

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from sidestep.loop.rollout import Trajectory
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import Status
-from sidestep.safety.shield_check import shield_level
+from sidestep.safety.certificate.shield_check import shield_level
 from sidestep.trials.captures import explain_capture
 from sidestep.trials.falsification.attackers import escape_margin
-from sidestep.trials.rollout import Trajectory
 from sidestep.world import Scenario, World
 
 ASSUMPTIONS: dict[str, str] = {

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sidestep.safety.catalogue import SHIELDS
+from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.views.play.helm import STRATEGIES
 from sidestep.views.play.sliders import Slider
 

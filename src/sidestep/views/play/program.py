@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from sidestep._arrays import real
-from sidestep.learning.control_step import control_step, decide
+from sidestep.loop.step import control_step, decide
 from sidestep.safety import (
     GameMemory,
     GameShield,
@@ -25,9 +25,9 @@ from sidestep.safety import (
     compose,
     make_shield,
 )
-from sidestep.safety.barriers import BarrierRows
-from sidestep.safety.sampling_margin import guarded, sampling_margin
-from sidestep.safety.way_out import way_out
+from sidestep.safety.barriers.barrier import BarrierRows
+from sidestep.safety.barriers.sampling_margin import guarded, sampling_margin
+from sidestep.safety.shields.way_out import way_out
 from sidestep.views.play.helm import Helm
 from sidestep.views.play.layout import Layout
 from sidestep.world import Scenario, World

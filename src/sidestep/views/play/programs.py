@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, final
 
-from sidestep.safety.catalogue import SHIELDS
+from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.views.play.program import Program, Starts, traced
 from sidestep.world import Scenario
 

@@ -7,7 +7,7 @@ from typing import Any, final
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.trials import Trajectory
+from sidestep.loop import Trajectory
 from sidestep.views.play.layout import Layout
 from sidestep.views.play.program import EVENTS
 from sidestep.world import Events

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from sidestep._packages import needed
-from sidestep.safety.catalogue import SHIELDS
-from sidestep.trials import Trajectory, save_trajectory
-from sidestep.trials.policies import as_policy
+from sidestep.loop import Trajectory, save_trajectory
+from sidestep.loop.policies import as_policy
+from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.views.play.helm import STRATEGIES
 from sidestep.views.play.limits import Limits
 from sidestep.views.play.messages import PACES, YOU

@@ -7,8 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from sidestep.safety.situation import plain
-from sidestep.safety.status import Status
+from sidestep.safety.certificate.situation import plain
+from sidestep.safety.filter.status import Status
 from sidestep.views.play import helm
 from sidestep.views.play.limits import Limits
 from sidestep.views.play.messages import (

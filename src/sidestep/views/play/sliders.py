@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 
 from sidestep._arrays import real
-from sidestep.safety.situation import plain
+from sidestep.safety.certificate.situation import plain
 from sidestep.world import Scenario
 
 _TIP_ROOM = 0.3

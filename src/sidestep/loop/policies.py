@@ -1,0 +1,98 @@
+"""Anyone's policy, written with JAX or not, as something a compiled trial can call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sidestep._arrays import AnyArray, real
+from sidestep.loop.step import decision_steps_of
+from sidestep.world import Scenario, goal_seeking, goal_seeking_world, observation_size
+
+GOAL_SEEKING = "goal-seeking"
+_WRONG_SHAPE = "a policy must answer one observation with an action of shape (2,), not {}"
+
+
+@final
+class HostPolicy(eqx.Module):
+    """A policy that needs concrete numbers (NumPy, PyTorch, Python's `if`), asked on the host.
+
+    It works under `jit` and `vmap`, one observation at a time, each a fresh NumPy array of floats.
+    """
+
+    policy: Callable[..., Any] = eqx.field(static=True)
+    decision_steps: int = eqx.field(static=True)
+
+    def __call__(self, observation: Float[AnyArray, "observation"]) -> Float[Array, "2"]:
+        dtype = real(0.0).dtype
+
+        def ask(observations: Any) -> np.ndarray:
+            observations = np.array(observations)
+            flat = observations.reshape(-1, observations.shape[-1])
+            answers = np.stack([_host_action(self.policy, one).astype(dtype) for one in flat])
+            return answers.reshape(*observations.shape[:-1], 2)
+
+        answer = jax.ShapeDtypeStruct((2,), dtype)
+        return jax.pure_callback(ask, answer, observation, vmap_method="expand_dims")
+
+
+def _host_action(policy: Callable[..., Any], observation: np.ndarray) -> np.ndarray:
+    action = np.asarray(policy(observation))
+    if action.shape != (2,):
+        raise ValueError(_WRONG_SHAPE.format(action.shape))
+    if not np.issubdtype(action.dtype, np.number) or np.issubdtype(action.dtype, np.complexfloating):
+        raise ValueError(f"a policy must answer with two real numbers, not {action!r}")
+    return action
+
+
+def as_policy(policy: Any, scenario: Scenario) -> Callable[..., Any]:
+    """A policy `(observation) -> action in [-1, 1]^2` that JAX can trace.
+
+    **Arguments:** `policy` the name `goal-seeking` or any callable. One that JAX cannot trace, or that
+    answers with something other than a JAX array when traced (so that NumPy's random numbers, say, would be
+    drawn only once), is asked on the host: right, but slower.
+
+    **Raises** `TypeError` for what cannot be called, `ValueError` for an unknown name or an answer that is
+    not two real numbers, and whatever the policy itself raises.
+    """
+    if isinstance(policy, str):
+        if policy != GOAL_SEEKING:
+            raise ValueError(f"unknown policy '{policy}'; known: {GOAL_SEEKING}, or give a callable")
+        return goal_seeking if scenario.frame == "target" else goal_seeking_world
+    if not callable(policy):
+        raise TypeError(f"a policy is a callable (observation) -> action in [-1, 1]^2; got {policy!r}")
+    decision_steps = decision_steps_of(policy)
+    observation = real(np.zeros(observation_size(scenario)))
+    traced = _traced_answer(policy, observation)
+    if traced is None:
+        _host_action(policy, np.array(observation))
+        return HostPolicy(policy, decision_steps)
+    if jnp.shape(traced) != (2,):
+        raise ValueError(_WRONG_SHAPE.format(jnp.shape(traced)))
+    return policy
+
+
+def _traced_answer(policy: Callable[..., Any], observation: Float[Array, "observation"]) -> Any:
+    """Shape and type of the policy's answer under tracing; None when it cannot be traced or ignores it."""
+    traced = False
+
+    def probe(observation: Array) -> Any:
+        nonlocal traced
+        answer = policy(observation)
+        leaves = jax.tree.leaves(answer)
+        traced = bool(leaves) and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+        return jnp.asarray(answer)
+
+    try:
+        answer = jax.eval_shape(probe, observation)
+    except Exception:
+        # Whatever went wrong goes wrong again, in the open, when the host asks the policy.
+        return None
+    return answer if traced else None

@@ -1,0 +1,226 @@
+"""One episode, recorded period by period."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sidestep._arrays import whole_number
+from sidestep.loop.keys import as_key, start_and_pursuit
+from sidestep.loop.policies import as_policy
+from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.pursuit import as_pursuer
+from sidestep.safety import Shield, as_shield
+from sidestep.store.files import json_safe, write_bytes
+from sidestep.store.runs import OUTCOMES
+from sidestep.world import Events, Scenario, World, load_scenario, scenario_to_dict
+from sidestep.world.state import worlds_of
+
+_TOLD = "told"
+
+
+class Trajectory(eqx.Module):
+    """One episode of T control periods. Period t begins in world t and ends in world t + 1.
+
+    **Attributes:** `worlds` with a leading axis of T + 1; the rest with one of T: `nominal` and `action`
+    velocities (m/s, world axes), `wheel_speeds` (m, 2) m/s as the pursuers asked for them (they stood still
+    where these are not finite), `status` (see `Status`), `barriers` (m + k) in m, `slack` and `intervention`
+    in m/s, `events`.
+    """
+
+    worlds: World
+    nominal: Float[Array, "*batch 2"]
+    action: Float[Array, "*batch 2"]
+    wheel_speeds: Float[Array, "*batch m 2"]
+    status: Int[Array, "*batch"]
+    barriers: Float[Array, "*batch n"]
+    slack: Float[Array, "*batch"]
+    intervention: Float[Array, "*batch"]
+    events: Events
+
+    @property
+    def length(self) -> int:
+        """Control periods T."""
+        return int(self.status.shape[0])
+
+    @property
+    def pursuer_invalid(self) -> int:
+        """Control periods in which a pursuer answered with wheel speeds that are not finite."""
+        return int(np.sum(~np.all(np.isfinite(self.wheel_speeds), axis=(-2, -1))))
+
+    @property
+    def outcome(self) -> str:
+        """How the episode ended (see `OUTCOMES`); `cut` when it was recorded no further."""
+        index = int(outcome_of(jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), self.events)))
+        return "cut" if index == RUNNING else OUTCOMES[index]
+
+
+@eqx.filter_jit
+def _record(
+    scenario: Scenario,
+    policy: Callable[..., Any],
+    shield: Any,
+    pursuer: Callable[..., Any],
+    world: World,
+    key: PRNGKeyArray,
+    steps: int,
+) -> tuple[Int[Array, ""], Trajectory]:
+    """Record until the episode ends, or for `steps` periods; what lies beyond the returned length is zero."""
+    decision_steps = decision_steps_of(policy)
+
+    def period(count: Array, world: World, memory: Any, held: Array) -> tuple[World, Any, Trajectory]:
+        nominal = jax.lax.cond(
+            count % decision_steps == 0, lambda: decide(scenario, policy, world), lambda: held
+        )
+        moved, memory, events, result, wheels = control_step(
+            scenario, shield, pursuer, world, memory, nominal, jax.random.fold_in(key, count)
+        )
+        return (
+            moved,
+            memory,
+            Trajectory(
+                worlds=moved,
+                nominal=nominal,
+                action=result.action,
+                wheel_speeds=wheels,
+                status=result.status,
+                barriers=result.barriers,
+                slack=result.slack,
+                intervention=result.intervention,
+                events=events,
+            ),
+        )
+
+    def running(carry: tuple[Any, ...]) -> Array:
+        count, outcome, *_ = carry
+        return (count < steps) & (outcome == RUNNING)
+
+    def store(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        count, _, world, memory, held, record = carry
+        world, memory, entry = period(count, world, memory, held)
+        record = jax.tree.map(lambda whole, one: whole.at[count].set(one), record, entry)
+        return count + 1, outcome_of(entry.events), world, memory, entry.nominal, record
+
+    begin = (jnp.zeros((), jnp.int32), world, shield.init(world), jnp.zeros_like(world.evader))
+    shapes = eqx.filter_eval_shape(period, *begin)[2]
+    record = jax.tree.map(lambda leaf: jnp.zeros((steps, *leaf.shape), leaf.dtype), shapes)
+    carry = (begin[0], jnp.full((), RUNNING, jnp.int32), *begin[1:], record)
+    count, *_, record = jax.lax.while_loop(running, store, carry)
+    worlds = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world, record.worlds)
+    return count, eqx.tree_at(lambda record: record.worlds, record, worlds)
+
+
+@eqx.filter_jit
+def _reset(scenario: Scenario, key: PRNGKeyArray) -> World:
+    return scenario.reset(key)
+
+
+def rollout(
+    scenario: Scenario,
+    policy: str | Callable[..., Any],
+    shield: str | Shield,
+    pursuer: str | Callable[..., Any],
+    key: PRNGKeyArray | int,
+    world: World | None = None,
+    *,
+    steps: int | None = None,
+) -> Trajectory:
+    """Run one episode and record it.
+
+    With `episode_key(key, i)` it is episode i of `evaluate(..., key)` again.
+
+    **Arguments:** as for `evaluate`; `world` to start in, drawn from the scenario if not given; `steps` at
+    most this many control periods (the scenario's `episode_steps` if not given).
+
+    **Raises** as `evaluate`.
+    """
+    steps = scenario.episode_steps if steps is None else whole_number("steps", steps)
+    policy = as_policy(policy, scenario)
+    shield = as_shield(shield, scenario)
+    pursuer = as_pursuer(pursuer)
+    start_key, pursuit_key = start_and_pursuit(as_key(key))
+    world = _reset(scenario, start_key) if world is None else world
+    count, record = _record(scenario, policy, shield, pursuer, world, pursuit_key, steps)
+    length = int(count)
+    # Cut on the host: JAX would compile one slice per leaf for every new length.
+    cut = lambda leaf, end: jnp.asarray(np.asarray(leaf)[:end])  # noqa: E731
+    worlds = jax.tree.map(lambda leaf: cut(leaf, length + 1), record.worlds)
+    record = jax.tree.map(lambda leaf: cut(leaf, length), eqx.tree_at(lambda r: r.worlds, record, None))
+    return eqx.tree_at(lambda r: r.worlds, record, worlds, is_leaf=lambda leaf: leaf is None)
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A trajectory with the `scenario` it was recorded in (None: nobody said) and what else to say of it."""
+
+    trajectory: Trajectory
+    scenario: Scenario | None
+    about: Mapping[str, Any]
+
+
+def save_trajectory(
+    path: str | Path,
+    trajectory: Trajectory,
+    scenario: Scenario | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a trajectory as a NumPy archive of plain arrays, whole or not at all.
+
+    **Arguments:** `scenario` it was recorded in, and what to say `about` it as JSON values by name, `shield`
+    among them; `load_episode` gives both back.
+    """
+    buffer = BytesIO()
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(trajectory).items()}
+    if scenario is not None:
+        told = json_safe({"scenario": scenario_to_dict(scenario), "about": about or {}})
+        arrays[_TOLD] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    np.savez_compressed(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_trajectory(path: str | Path) -> Trajectory:
+    """What `save_trajectory` wrote. **Raises** `ValueError` when the file is no such archive."""
+    return load_episode(path).trajectory
+
+
+def _without_code(scenario: Mapping[str, Any]) -> dict[str, Any]:
+    models = ("evader_model", "pursuer_model")
+    nameless = {name: None for name in models if not isinstance(scenario.get(name), Mapping)}
+    return {**scenario, **nameless}
+
+
+def load_episode(path: str | Path) -> Episode:
+    """What `save_trajectory` wrote, with what it was told. **Raises** as `load_trajectory`."""
+    try:
+        with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
+            arrays = {name: jnp.asarray(archive[name]) for name in archive.files if name != _TOLD}
+            told = json.loads(bytes(archive[_TOLD])) if _TOLD in archive.files else {}
+        places = {name: arrays.pop(name) for name in list(arrays) if name.startswith("worlds.")}
+        events = {name: arrays.pop(name) for name in list(arrays) if name.startswith("events.")}
+        trajectory = Trajectory(
+            worlds=worlds_of({name.removeprefix("worlds."): values for name, values in places.items()}),
+            events=Events(**{name.removeprefix("events."): values for name, values in events.items()}),
+            **arrays,
+        )
+        # Custom robots that have no name are code, and what was recorded needs none of it. Those with a name
+        # are kept: the sets that figures draw depend on them.
+        scenario = load_scenario("paper", **_without_code(told["scenario"])) if told else None
+        return Episode(trajectory, scenario, told.get("about", {}))
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} holds no recorded trajectory: {error}") from error

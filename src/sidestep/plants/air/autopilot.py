@@ -1,0 +1,136 @@
+"""How does a quadrotor fly the motion that it is asked for? A cascade, from position to rotors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, final
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.plants.air.airframe import Airframe
+from sidestep.world.flyers import GRAVITY
+
+Vector = Float[np.ndarray, "3"]
+Matrix = Float[np.ndarray, "3 3"]
+
+
+class Setpoint(NamedTuple):
+    """A motion to follow at this moment: m, m/s, m/s^2, m/s^3, world axes."""
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+    jerk: Vector
+
+
+class Attitude(NamedTuple):
+    """`rotation (3, 3)` from the body's axes to the world's, `rates (3,)` rad/s in the body's axes."""
+
+    rotation: Matrix
+    rates: Vector
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Of the cascade, outermost loop first.
+
+    - `position` 1/s: velocity asked for per metre off
+    - `velocity` 1/s: acceleration per m/s off; `integral` 1/s^2 of the same, against drag and wind, at most
+      `integral_limit` m/s^2
+    - `attitude` 1/s^2 and `rates` 1/s: angular acceleration per rad and rad/s off, roll and pitch; a third of
+      the first, and the same of the second, in yaw
+    - `largest_tilt` rad: the thrust never leans over more
+    """
+
+    position: float = 4.0
+    velocity: float = 6.0
+    integral: float = 3.0
+    integral_limit: float = 1.0
+    attitude: float = 340.0
+    rates: float = 30.0
+    largest_tilt: float = math.radians(45.0)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _vee(matrix: Matrix) -> Vector:
+    return np.array([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
+
+
+@final
+class Autopilot:
+    """Position and velocity loops ask for an acceleration, the thrust leans to give it, body rates follow,
+    and a mixer shares thrust and torques out among the rotors.
+
+    The attitude law is that of Lee, Leok, McClamroch, "Geometric tracking control of a quadrotor UAV on
+    SE(3)", CDC 2010, with the rates that the setpoint's jerk asks for. Where the rotors cannot give all,
+    yaw is given up first, then the collective thrust shifts, so that the attitude is kept.
+    """
+
+    def __init__(self, frame: Airframe, gains: Gains | None = None):
+        self.frame, self.gains = frame, gains or Gains()
+        self._inertia = np.array(frame.inertia)
+        x, y = np.array(frame.rotor_places).T
+        turning = np.array(frame.rotor_senses) * frame.rotor_torque
+        self._mixer = np.linalg.inv(np.stack([np.ones(4), y, -x, turning]))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what the integral has gathered."""
+        self._gathered = np.zeros(3)
+        self.saturated = False
+
+    def thrusts(
+        self, wanted: Setpoint, position: Vector, velocity: Vector, attitude: Attitude, period: float
+    ) -> Float[np.ndarray, "4"]:
+        """Thrust (N) of every rotor for the next `period` (s), from where the quadrotor thinks it is (m, m/s)
+        and how it is turned."""
+        gains, frame = self.gains, self.frame
+        off = wanted.velocity - velocity + gains.position * (wanted.position - position)
+        limit = gains.integral_limit
+        self._gathered = np.clip(self._gathered + gains.integral * period * off, -limit, limit)
+        push = wanted.acceleration + gains.velocity * off + self._gathered
+        push[2] = max(push[2] + GRAVITY, 0.3 * GRAVITY)
+        aside, most = math.hypot(push[0], push[1]), push[2] * math.tan(gains.largest_tilt)
+        self.saturated = aside > most
+        if self.saturated:
+            push[:2] *= most / aside
+        size = math.sqrt(push @ push)
+        up = push / size
+        # Heading 0: the body's y axis stays across the world's x.
+        left = _cross(up, np.array([1.0, 0.0, 0.0]))
+        left /= math.sqrt(left @ left)
+        aim = np.stack([_cross(left, up), left, up], axis=1)
+        # How fast the wanted thrust direction turns, from the jerk; heading stays.
+        leaning = (wanted.jerk - up * (up @ wanted.jerk)) / size
+        turning = aim.T @ _cross(up, leaning)
+        turning[2] = 0.0
+        rotation, rates = attitude
+        error = 0.5 * _vee(aim.T @ rotation - rotation.T @ aim)
+        off_rates = rates - rotation.T @ (aim @ turning)
+        share = np.array([1.0, 1.0, 1.0 / 3.0])
+        turn = -gains.attitude * share * error - gains.rates * off_rates
+        torque = self._inertia * turn + _cross(rates, self._inertia * rates)
+        return self._mix(float(frame.mass * (push @ rotation[:, 2])), torque)
+
+    def _mix(self, thrust: float, torque: Vector) -> Float[np.ndarray, "4"]:
+        most = self.frame.largest_thrust
+        level = self._mixer[:, 0] * thrust
+        lean = self._mixer[:, 1] * torque[0] + self._mixer[:, 2] * torque[1]
+        yaw = self._mixer[:, 3] * torque[2]
+        wanted = level + lean
+        room = min(float(np.min(wanted)), float(np.min(most - wanted)))
+        peak = float(np.max(np.abs(yaw)))
+        if peak > 0.0 and room < peak:
+            self.saturated = True
+            yaw = yaw * max(room, 0.0) / peak
+        wanted = wanted + yaw
+        low, high = float(np.min(wanted)), float(np.max(wanted))
+        if low < 0.0 or high > most:
+            self.saturated = True
+            wanted += -low if low < 0.0 else most - high
+        return np.clip(wanted, 0.0, most)

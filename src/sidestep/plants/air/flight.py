@@ -1,0 +1,298 @@
+"""Where is everything at every millisecond of a flight, and what has been measured of it?"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.plants.air.airframe import ROTORS, scene_xml
+from sidestep.plants.air.autopilot import Attitude, Autopilot, Setpoint
+from sidestep.plants.air.estimate import OwnMotion
+from sidestep.plants.air.options import FlightOptions, check_scenario
+from sidestep.plants.ground import Contacts, Measurement, TwinError, Watch
+from sidestep.plants.ground.library import check_robots, load_mujoco
+from sidestep.plants.ground.sensors import PoseSensors
+from sidestep.views.style import EVADER, OBSTACLE, PURSUER
+from sidestep.world import Scenario, World
+from sidestep.world.flyers import GRAVITY, Quadrotor
+from sidestep.world.robots import body_velocity
+
+_FRAME_RATE = 100.0
+_COLUMN = 0.6
+"""Radius of a column, as a share of the collision distance; the quadrotor needs the rest."""
+
+
+def _transition(model: Quadrotor, time: float) -> Float[np.ndarray, "4 4"]:
+    """What `time` (s) makes of position, velocity, acceleration and the velocity told, per axis."""
+    tau, lag = float(model.time_constant), float(model.attitude_lag)
+    rate = time * np.array(
+        [[0, 1, 0, 0], [0, 0, 1, 0], [0, -1 / (tau * lag), -1 / lag, 1 / (tau * lag)], [0, 0, 0, 0]]
+    )
+    whole, term = np.eye(4), np.eye(4)
+    for order in range(1, 20):
+        term = term @ rate / order
+        whole = whole + term
+    return whole
+
+
+class _Aircraft:
+    """Exact motion along the heading; speed and turn rate follow what is told with a lag."""
+
+    def __init__(self, pose: Float[np.ndarray, "3"], speed: float):
+        self.pose = np.array(pose, float)
+        self.motion = np.array([speed, 0.0])
+        self.told = self.motion.copy()
+
+    def step(self, time: float, share: float) -> None:
+        self.motion += share * (self.told - self.motion)
+        speed, turn_rate = self.motion
+        half = 0.5 * turn_rate * time
+        chord = speed * time * (math.sin(half) / half if half else 1.0)
+        self.pose[0] += chord * math.cos(self.pose[2] + half)
+        self.pose[1] += chord * math.sin(self.pose[2] + half)
+        self.pose[2] = math.remainder(self.pose[2] + 2.0 * half, 2.0 * math.pi)
+
+
+@final
+class Flight:
+    """The scenario's quadrotor in MuJoCo, flown by its autopilot, with an aircraft and columns.
+
+    As `plants.ground.Twin`: `reset`, then `command`, `advance` and `measurements`. What the shield is
+    told of the quadrotor is `reference`: the motion that the velocities told make of `Quadrotor`, which the
+    autopilot flies after. How far it is from that is `tracking_error`.
+
+    **Attributes:** `model` and `data` of MuJoCo; `frames` at 100 Hz (`positions (n, nq)`, and poses of the
+    mocap bodies) and `frame_times (n,)` in s, to be drawn.
+
+    **Raises** `TwinError` when MuJoCo is missing, or for a scenario without a quadrotor.
+    """
+
+    def __init__(self, scenario: Scenario, options: FlightOptions | None = None, seed: int = 0):
+        self.scenario, self.options = scenario, options or FlightOptions()
+        check_scenario(scenario, self.options)
+        self._mujoco = mujoco = load_mujoco()
+        self._seed = seed
+        self.counts = (scenario.pursuer_count, scenario.obstacle_count)
+        xml = scene_xml(
+            self.options.airframe,
+            *self.counts,
+            physics_step=self.options.physics_step,
+            column_radius=_COLUMN * float(scenario.collision_distance),
+            column_height=2.0 * self.options.height,
+            colours=(EVADER, PURSUER, OBSTACLE),
+        )
+        self.model: Any = mujoco.MjModel.from_xml_string(xml)
+        self.data: Any = mujoco.MjData(self.model)
+        find = mujoco.mj_name2id
+        self._body = find(self.model, mujoco.mjtObj.mjOBJ_BODY, "quadrotor")
+        self._motors = [find(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in ROTORS]
+        names = [f"pursuer{i}" for i in range(self.counts[0])] + [
+            f"obstacle{i}" for i in range(self.counts[1])
+        ]
+        bodies = [find(self.model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
+        self._mocap = [int(self.model.body_mocapid[body]) for body in bodies]
+        self._ticks = round(self.options.autopilot_period / self.options.physics_step)
+        model = scenario.evader_model
+        assert isinstance(model, Quadrotor)
+        self._transition = _transition(model, self.options.autopilot_period)
+        self._lags = float(model.time_constant), float(model.attitude_lag)
+        self._autopilot = Autopilot(self.options.airframe, self.options.gains)
+        self._speed = float(scenario.evader_speed)
+
+    def reset(self, world: World, seed: int | None = None) -> None:
+        """Everything where `world` has it: the quadrotor hovers, the aircraft flies straight on, at time 0.
+
+        **Raises** `TwinError` for a world with other numbers of robots than the scenario's.
+        """
+        counts = self.counts
+        check_robots(world, *counts)
+        self._seed = self._seed if seed is None else seed
+        options, data = self.options, self.data
+        self._target, self._steps = np.asarray(world.target, float), 0
+        self._mujoco.mj_resetData(self.model, data)
+        place = np.array([*np.asarray(world.evader, float), options.height])
+        data.qpos[:3], data.qpos[3:7] = place, (1.0, 0.0, 0.0, 0.0)
+        hover = options.airframe.mass * GRAVITY / 4.0
+        data.act[:], data.ctrl[self._motors] = hover, hover
+        self._plan = np.zeros((4, 2))
+        self._plan[0] = place[:2]
+        slowest = float(self._drivable(np.zeros((counts[0], 2)))[0, 0]) if counts[0] else 0.0
+        self._aircraft = [_Aircraft(pose, slowest) for pose in np.asarray(world.pursuers, float)]
+        self._columns = np.asarray(world.obstacles, float).copy()
+        self._autopilot.reset()
+        self._contacts = Watch(self.scenario, self._target)
+        self.frames: list[Any] = []
+        self.frame_times: list[float] = []
+        self.tracking_error = 0.0
+        self.saturated = 0.0
+        root = np.random.default_rng(self._seed)
+        self._sensors = PoseSensors(options.sensors, counts, options.physics_step, root)
+        (self._noise,) = root.spawn(1)
+        self._own = OwnMotion(
+            options.acceleration_noise, options.sensors.position_noise, 1.0 / options.sensors.rate
+        )
+        self._own.start(0.0, place, np.zeros(3))
+        axis, lean = self._noise.uniform(-math.pi, math.pi), 0.5 * options.tilt_bias
+        self._level = np.zeros(9)
+        turned = (math.cos(lean), math.sin(lean) * math.cos(axis), math.sin(lean) * math.sin(axis), 0.0)
+        self._mujoco.mju_quat2Mat(self._level, np.array(turned))
+        self._level = self._level.reshape(3, 3)
+        self._show()
+        self._mujoco.mj_forward(self.model, data)
+        ahead = [
+            craft.motion[0] * np.array([math.cos(craft.pose[2]), math.sin(craft.pose[2])])
+            for craft in self._aircraft
+        ]
+        moving = np.array([np.zeros(2), *ahead, *self._columns[:, 2:]])
+        self._sensors.watch_the_start(self._poses(), moving)
+        # Its own start is known.
+        self._sensors.evaders(0.0)
+
+    @property
+    def time(self) -> float:
+        """Seconds since the reset."""
+        return self._steps * self.options.physics_step
+
+    @property
+    def least_distances(self) -> tuple[float, float]:
+        """Least true distances (m) to a pursuer and to an obstacle since the reset; infinite without one."""
+        return self._contacts.least
+
+    @property
+    def reference(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+        """Position (m), velocity (m/s) and acceleration (m/s^2) that the autopilot is asked for now."""
+        return self._plan[0].copy(), self._plan[1].copy(), self._plan[2].copy()
+
+    @property
+    def control_point(self) -> Float[np.ndarray, "2"]:
+        """The point (m) of `reference` that moves as told, see `sidestep.world.Quadrotor`."""
+        tau, lag = self._lags
+        return self._plan[0] + tau * (self._plan[1] + lag * self._plan[2])
+
+    def command(self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"]) -> None:
+        """What the quadrotor (m/s, world axes) and the pursuers (as strategies answer) are told from now on,
+        cut to their limits; numbers that are not finite count as a stop."""
+        wanted = np.asarray(velocity, float)
+        wanted = wanted if np.all(np.isfinite(wanted)) else np.zeros(2)
+        speed = math.hypot(*wanted)
+        self._plan[3] = wanted * (self._speed / speed) if speed > self._speed else wanted
+        if len(self._aircraft):
+            for aircraft, told in zip(self._aircraft, self._drivable(wheel_speeds), strict=True):
+                aircraft.told = told
+
+    def _drivable(self, wheel_speeds: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+        """Speeds (m/s) and turn rates (rad/s) that the scenario's pursuer makes of these."""
+        scenario = self.scenario
+        taken = [scenario.drivable(np.asarray(pair, np.float32)) for pair in np.asarray(wheel_speeds)]
+        return np.array(
+            [[float(part) for part in body_velocity(p, scenario.pursuer_half_axle)] for p in taken]
+        )
+
+    def advance(self, duration: float) -> Contacts:
+        """Let `duration` (s) pass, in whole physics steps, and say how near the evader came to what."""
+        options, data, step = self.options, self.data, self.options.physics_step
+        count = round((self.time + duration) / step) - self._steps
+        every = max(round(1.0 / (_FRAME_RATE * step)), 1)
+        share = -math.expm1(-step / options.pursuer_lag)
+        poses = np.empty((count, 1 + len(self._mocap), 3))
+        wind = np.array([*options.wind, 0.0])
+        for index in range(count):
+            if self._steps % every == 0:
+                self.frames.append((data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()))
+                self.frame_times.append(self.time)
+            if self._steps % self._ticks == 0:
+                self._fly()
+            data.xfrc_applied[self._body, :3] = options.airframe.drag * (wind - data.qvel[:3])
+            for aircraft in self._aircraft:
+                aircraft.step(step, share)
+            self._columns[:, :2] += step * self._columns[:, 2:]
+            self._show()
+            self._mujoco.mj_step(self.model, data)
+            self._steps += 1
+            if self._steps % self._ticks == 0:
+                self._plan[:] = self._transition @ self._plan
+            poses[index] = self._poses()
+            self._sensors.watch(self._steps, poses[index : index + 1])
+        if not np.all(np.isfinite(poses)) or abs(data.qpos[2] - options.height) > 0.5 * options.height:
+            raise TwinError(
+                f"the quadrotor lost its height at {self.time:.3f} s: its gains, or its rotors, do not do "
+                "for what it is told"
+            )
+        return self._contacts.see(poses)
+
+    def _fly(self) -> None:
+        """One period of the autopilot."""
+        data, period = self.data, self.options.autopilot_period
+        plan = self._plan
+        tau, lag = self._lags
+        rotation = np.asarray(data.xmat[self._body]).reshape(3, 3)
+        felt = np.asarray(data.qacc[:3]) + self._noise.standard_normal(3) * (
+            self.options.acceleration_noise / math.sqrt(period)
+        )
+        # Read in the body's axes, and turned back by what is taken for level, gravity too.
+        taken = self._level @ rotation
+        weight = np.array([0.0, 0.0, GRAVITY])
+        felt = taken @ (rotation.T @ (felt + weight)) - weight
+        if self._steps:
+            self._own.feel(self.time, felt, period)
+        for seen in self._sensors.evaders(self.time):
+            # The height is measured by the same cameras.
+            height = self.data.qpos[2] + self._noise.standard_normal() * self.options.sensors.position_noise
+            self._own.see(seen.stamp, np.array([*seen.pose[:2], height]))
+        jerk = ((plan[3] - plan[1]) / tau - plan[2]) / lag
+        level = (np.array([*part, 0.0]) for part in (plan[1], plan[2], jerk))
+        wanted = Setpoint(np.array([*plan[0], self.options.height]), *level)
+        attitude = Attitude(taken, np.asarray(data.qvel[3:6]).copy())
+        own = self._own
+        thrusts = self._autopilot.thrusts(wanted, own.position, own.velocity, attitude, period)
+        data.ctrl[self._motors] = thrusts
+        self.tracking_error = max(self.tracking_error, math.dist(data.qpos[:2], plan[0]))
+        self.saturated += period * self._autopilot.saturated
+
+    def _show(self) -> None:
+        """Put the bodies that only move where they are."""
+        data, height = self.data, self.options.height
+        for body, aircraft in zip(self._mocap, self._aircraft, strict=False):
+            speed, turn_rate = aircraft.motion
+            bank, heading = -0.5 * math.atan(speed * turn_rate / GRAVITY), 0.5 * aircraft.pose[2]
+            data.mocap_pos[body] = (*aircraft.pose[:2], height)
+            data.mocap_quat[body] = (
+                math.cos(heading) * math.cos(bank),
+                math.cos(heading) * math.sin(bank),
+                math.sin(heading) * math.sin(bank),
+                math.sin(heading) * math.cos(bank),
+            )
+        for body, column in zip(self._mocap[len(self._aircraft) :], self._columns, strict=True):
+            data.mocap_pos[body, :2] = column[:2]
+
+    def _poses(self) -> Float[np.ndarray, "robots 3"]:
+        """x, y and heading of everybody now, evader first, then pursuers, then columns."""
+        w, x, y, z = self.data.qpos[3:7]
+        heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        columns = [[x, y, 0.0] for x, y in self._columns[:, :2]]
+        places = [[*self.data.qpos[:2], heading], *(craft.pose for craft in self._aircraft), *columns]
+        return np.array(places, float)
+
+    def measurements(self) -> list[Measurement]:
+        """Poses of the others that have arrived by now and were not handed out before, oldest first."""
+        return self._sensors.others(self.time)
+
+    @property
+    def world(self) -> World:
+        """The truth now."""
+        axle = float(self.scenario.pursuer_half_axle)
+        motions = np.array([craft.motion for craft in self._aircraft], float).reshape(-1, 2)
+        speed, turn = motions[:, :1], axle * motions[:, 1:]
+        return World(
+            evader=np.asarray(self.data.qpos[:2]),
+            pursuers=np.array([craft.pose for craft in self._aircraft]).reshape(-1, 3),
+            obstacles=self._columns.copy(),
+            target=self._target,
+            time=self.time,
+            evader_velocity=np.asarray(self.data.qvel[:2]),
+            wheel_speeds=np.concatenate([speed - turn, speed + turn], axis=1),
+            evader_state=self._plan[2].copy(),
+        )

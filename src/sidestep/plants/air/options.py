@@ -1,0 +1,117 @@
+"""How is the quadrotor built, and what disturbs it?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from sidestep.plants.air.airframe import Airframe
+from sidestep.plants.air.autopilot import Gains
+from sidestep.plants.ground import PURSUER_SEES, Sensors, TwinError
+from sidestep.safety import Budget
+from sidestep.world import Scenario
+from sidestep.world.flyers import GRAVITY, Quadrotor
+
+ROOM_SENSORS = Sensors(rate=100.0, position_noise=0.001, heading_noise=math.radians(0.25), delay=0.01)
+"""Motion capture of a room for small drones."""
+
+
+@dataclass(frozen=True)
+class FlightOptions:
+    """Everything about a flight that the scenario does not say.
+
+    - `airframe`, `gains`; `sensors` of everybody's poses, the quadrotor's own among them
+    - `tracking_error` m: how far the quadrotor may be from the motion that it is asked for. The shield allows
+      for it, and a flight that breaks it says so
+    - `acceleration_noise` m/s^2 per root hertz and `tilt_bias` rad: errors of its accelerometer, and of what
+      it takes for level
+    - `wind (2,)` m/s
+    - `pursuer_lag` s: time constant with which the aircraft takes up a speed and a turn rate;
+      `pursuer_sees`, see `PURSUER_SEES`
+    - `height` of everybody, m
+    - `physics_step` and `autopilot_period`, s, the second a multiple of the first
+    """
+
+    airframe: Airframe = field(default_factory=Airframe)
+    gains: Gains = field(default_factory=Gains)
+    sensors: Sensors = ROOM_SENSORS
+    tracking_error: float = 0.04
+    acceleration_noise: float = 0.02
+    tilt_bias: float = math.radians(0.3)
+    wind: tuple[float, float] = (0.0, 0.0)
+    pursuer_lag: float = 0.1
+    pursuer_sees: str = "truth"
+    height: float = 0.8
+    physics_step: float = 0.001
+    autopilot_period: float = 0.002
+
+    def __post_init__(self):
+        if self.pursuer_sees not in PURSUER_SEES:
+            raise TwinError(
+                f"pursuer_sees = {self.pursuer_sees!r}: it must be one of {', '.join(PURSUER_SEES)}"
+            )
+        for name in ("tracking_error", "acceleration_noise", "tilt_bias"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise TwinError(f"{name} = {value!r}: it must be finite, 0 or more")
+        for name in ("pursuer_lag", "height"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise TwinError(f"{name} = {value!r}: it must be finite and greater than 0")
+        if len(self.wind) != 2 or not all(math.isfinite(part) for part in self.wind):
+            raise TwinError(f"wind = {self.wind!r}: it must be two finite numbers, m/s")
+        if not 0.0 < self.physics_step <= 0.002:
+            raise TwinError(f"physics_step = {self.physics_step!r}: it must be at most 0.002 s")
+        ticks = self.autopilot_period / self.physics_step
+        if not (0.0 < self.autopilot_period <= 0.01 and abs(ticks - round(ticks)) < 1e-6 and ticks > 0.5):
+            raise TwinError(
+                f"autopilot_period = {self.autopilot_period!r}: it must be at most 0.01 s, and a multiple of "
+                f"physics_step = {self.physics_step!r}"
+            )
+
+
+def errors_of(options: FlightOptions) -> dict[str, float]:
+    """What bounds the shield's errors, as `Budget` and `certify` take them.
+
+    In place the sensors' error of the other robot and how far the quadrotor is from the motion asked of it,
+    which is what the shield knows of it; in heading and delay the sensors'.
+    """
+    bounds = options.sensors.bounds()
+    # The bound counts both robots as measured; the evader's own place is in `tracking_error`.
+    position = 0.5 * bounds["position_error"] + options.tracking_error
+    return {**bounds, "position_error": position}
+
+
+def budget_of(options: FlightOptions) -> Budget:
+    """The shield's budget for `errors_of`."""
+    errors = errors_of(options)
+    return Budget(errors["position_error"], errors["heading_error"], errors["delay"])
+
+
+def check_scenario(scenario: Scenario, options: FlightOptions) -> None:
+    """**Raises** `TwinError` for a scenario whose evader is no `Quadrotor`, or one that leans too far."""
+    model = scenario.evader_model
+    if not isinstance(model, Quadrotor):
+        raise TwinError(
+            f"the scenario '{scenario.name}' has no quadrotor: use the preset 'quadrotor' or "
+            "'quadrotor-test', or set "
+            'evader_model = "quadrotor" and pursuer_model = "aircraft"'
+        )
+    if scenario.pursuer_model is None:
+        raise TwinError(
+            f"the scenario '{scenario.name}' sends a differential drive after a quadrotor: set "
+            'pursuer_model = "aircraft", or one of your own'
+        )
+    tilt, most = float(model.largest_tilt(scenario)), options.gains.largest_tilt
+    frame = options.airframe
+    lift = 4.0 * frame.largest_thrust * math.cos(tilt) / (GRAVITY * frame.mass)
+    if tilt >= most or lift <= 1.0:
+        why = (
+            f"leans {math.degrees(tilt):.0f} degrees, more than largest_tilt = {math.degrees(most):.0f}"
+            if tilt >= most
+            else f"leans {math.degrees(tilt):.0f} degrees, where its rotors cannot hold its height"
+        )
+        raise TwinError(
+            f"told any velocity up to {float(scenario.evader_speed):g} m/s, this quadrotor {why}: give its "
+            "model a longer time_constant, or a lower evader_speed"
+        )

@@ -1,0 +1,65 @@
+"""How is the twin built and measured?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from sidestep.plants.ground.library import TwinError
+from sidestep.plants.ground.robots import BASES
+from sidestep.plants.ground.sensors import SENSORS, Sensors
+from sidestep.world import Scenario
+
+PURSUER_SEES = ("truth", "measurements")
+"""What the pursuer decides from: where everything truly is, or what the evader measures too."""
+
+
+@dataclass(frozen=True)
+class TwinOptions:
+    """Everything about the twin that the scenario does not say.
+
+    - `base` of the evader, see `BASES`; `acceleration` m/s^2, the limit of its motors; `lag` s, the time
+      constant of its velocity servos; `pursuer_lag` s, that of the pursuers' wheels
+    - `sensors`; `actuation_delay` s from a command to its effect, of the evader
+    - `pursuer_sees`, see `PURSUER_SEES`
+    - `physics_step` s
+    """
+
+    base: str = "servo"
+    sensors: Sensors = SENSORS["motion-capture"]
+    actuation_delay: float = 0.0
+    acceleration: float = 2.0
+    lag: float = 0.02
+    pursuer_lag: float = 0.02
+    pursuer_sees: str = "truth"
+    physics_step: float = 0.001
+
+    def __post_init__(self):
+        if self.base not in BASES:
+            raise TwinError(f"base = {self.base!r}: it must be one of {', '.join(BASES)}")
+        if self.pursuer_sees not in PURSUER_SEES:
+            raise TwinError(
+                f"pursuer_sees = {self.pursuer_sees!r}: it must be one of {', '.join(PURSUER_SEES)}"
+            )
+        if not (math.isfinite(self.actuation_delay) and self.actuation_delay >= 0.0):
+            raise TwinError(f"actuation_delay = {self.actuation_delay!r}: it must be finite, 0 or more")
+        for name in ("acceleration", "lag", "pursuer_lag"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise TwinError(f"{name} = {value!r}: it must be finite and greater than 0")
+        if not 0.0 < self.physics_step <= 0.002:
+            raise TwinError(
+                f"physics_step = {self.physics_step!r}: it must be at most 0.002 s, for stability"
+            )
+
+
+def bounded_errors(scenario: Scenario, options: TwinOptions) -> dict[str, float]:
+    """The twin's errors as `sidestep.safety.certify` takes them.
+
+    The sensors' bounds, and in `delay` (s) also what passes until the motors obey: the actuation delay, the
+    servos' time constant, and half the time that a full reversal takes at the greatest acceleration.
+    """
+    bounds = options.sensors.bounds()
+    reversal = 2.0 * float(scenario.evader_speed) / options.acceleration
+    bounds["delay"] += options.actuation_delay + options.lag + reversal / 2.0
+    return bounds

@@ -1,0 +1,149 @@
+"""One call from numbers to numbers: policy and shield compiled together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sidestep._arrays import length, real
+from sidestep.loop.step import decide
+from sidestep.safety import PursuitBarrier, Shield
+from sidestep.safety.shields.look_ahead import clearance
+from sidestep.world import Scenario, World
+
+Numbers = Float[np.ndarray, "n"]
+
+
+class Seen(NamedTuple):
+    """Where everything is thought to be when the command acts: the parts of a `World`."""
+
+    evader: Numbers
+    pursuers: Float[np.ndarray, "m 3"]
+    obstacles: Float[np.ndarray, "k 4"]
+    target: Numbers
+    velocity: Numbers
+    wheel_speeds: Float[np.ndarray, "m 2"]
+    time: float
+
+    def world(self) -> World:
+        """As the rest of the package knows it."""
+        with np.errstate(over="ignore"):  # As in `Answering`.
+            return World(
+                self.evader,
+                self.pursuers,
+                self.obstacles,
+                self.target,
+                np.float64(self.time),
+                evader_velocity=self.velocity,
+                wheel_speeds=self.wheel_speeds,
+            )
+
+
+class Answer(NamedTuple):
+    """What the shield answered: a `ShieldResult` with the nominal velocity and the clearance."""
+
+    nominal: Numbers
+    action: Numbers
+    status: int
+    slack: float
+    intervention: float
+    clearance: float
+    barriers: Numbers
+
+    @classmethod
+    def of(cls, vector: Numbers, count: int) -> Answer:
+        """From its parts, one after the other; `count` barriers."""
+        return cls(
+            nominal=vector[:2],
+            action=vector[2:4],
+            status=int(vector[4]),
+            slack=float(vector[5]),
+            intervention=float(vector[6]),
+            clearance=float(vector[7]),
+            barriers=vector[8 : 8 + count],
+        )
+
+
+@final
+class Answering:
+    """A shield and a policy compiled into one call of one vector in and one out.
+
+    On small computers most of a decision's time is what it costs to hand many small arrays over.
+    """
+
+    def __init__(self, shield: Shield, policy: Callable[..., Any] | None):
+        scenario = shield.scenario
+        self._arrays, fixed = eqx.partition((shield, policy), eqx.is_array)
+        m, k = scenario.pursuer_count, scenario.obstacle_count
+        self._shapes: list[tuple[int, ...]] = [(2,), (m, 3), (k, 4), (2,), (2,), (m, 2), (), (2,), (), (), ()]
+        self._count = m + k
+
+        @jax.jit
+        def answer(arrays: Any, numbers: Array, memory: Any) -> tuple[Array, Any]:
+            shield, policy = eqx.combine(arrays, fixed)
+            parts = self._split(numbers)
+            evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
+            world = World(evader, pursuers, obstacles, target, time, velocity, wheels)
+            wished, ask, flee, delay = parts[7:]
+            outcome, memory = _answer(shield, policy, world, wished, ask, flee, delay, memory)
+            return jnp.concatenate([jnp.atleast_1d(part) for part in outcome]), memory
+
+        self._compiled = answer
+
+    def _split(self, numbers: Array) -> list[Array]:
+        sizes = [math.prod(shape) for shape in self._shapes]
+        parts = jnp.split(numbers, np.cumsum(sizes)[:-1])
+        return [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)]
+
+    def __call__(
+        self, world: Seen, wished: Numbers, ask: bool, flee: bool, delay: float, memory: Any
+    ) -> tuple[Answer, Any]:
+        """What was decided, and the next memory. `delay` (s) replaces the budget's."""
+        parts = (*world, wished, ask, flee, delay)
+        numbers = np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in parts])
+        with np.errstate(over="ignore"):  # Infinite is what it is then, and no answer follows from it.
+            numbers = numbers.astype(real(0.0).dtype)
+        vector, memory = self._compiled(self._arrays, numbers, memory)
+        return Answer.of(np.asarray(vector, np.float64), self._count), memory
+
+
+def _answer(
+    shield: Any,
+    policy: Any,
+    world: World,
+    wished: Array,
+    ask: Array,
+    flee: Array,
+    delay: Array,
+    memory: Any,
+) -> tuple[list[Array], Any]:
+    """The parts of an `Answer`, and the next memory.
+
+    `ask` the policy, if there is one, instead of taking the wish; `flee`: instead of either, full speed away
+    from the nearest pursuer.
+    """
+    scenario: Scenario = shield.scenario
+    nominal = wished
+    if policy is not None:
+        nominal = jnp.where(ask > 0.0, decide(scenario, policy, world), wished)
+        # Policies are made for the way there, and an episode ends at the target: a robot stays.
+        way = world.target - world.evader
+        nominal = jnp.where(length(way[0], way[1]) <= scenario.reach_distance, 0.0, nominal)
+    if scenario.pursuer_count:
+        barrier = PursuitBarrier()
+        rows = barrier.rows(scenario, world, barrier.remember(scenario, world))
+        away = rows.normals[jnp.argmin(rows.values)]
+        nominal = jnp.where(flee > 0.0, scenario.evader_speed * away, nominal)
+    if getattr(shield, "budget", None) is not None:
+        shield = eqx.tree_at(lambda shield: shield.budget.delay, shield, delay)
+    result, memory = shield(world, nominal, memory)
+    status = result.status.astype(nominal.dtype)
+    near = clearance(scenario, world)
+    return [nominal, result.action, status, result.slack, result.intervention, near, result.barriers], memory

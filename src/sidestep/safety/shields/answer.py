@@ -1,0 +1,110 @@
+"""From rows to a shield's answer: what may not be trusted is found, the filter asked, the status given."""
+
+from __future__ import annotations
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sidestep._arrays import AnyArray, fold, stack
+from sidestep.safety.barriers.barrier import Barrier, BarrierRows, ObstacleBarrier, compose
+from sidestep.safety.filter.least_violation import root
+from sidestep.safety.filter.projection import project
+from sidestep.safety.filter.status import Status
+from sidestep.safety.shields.shield import ShieldResult
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+
+def known_parts(world: World) -> Bool[Array, "n *lanes"]:
+    """Per pursuer and obstacle: whether it and the evader are where numbers say.
+
+    Asked of the world itself, because a NaN can vanish on its way into a row: every comparison with it is
+    false, and a `where` then takes the other case.
+    """
+    evader = _finite(world.evader)
+    return jnp.concatenate([_finite(group, 1) & evader for group in (world.pursuers, world.obstacles)])
+
+
+def _finite(components: Float[AnyArray, "..."], axis: int = 0) -> Bool[Array, "..."]:
+    parts = (jax.lax.index_in_dim(components, i, axis, False) for i in range(components.shape[axis]))
+    return functools.reduce(jnp.logical_and, map(jnp.isfinite, parts))
+
+
+def decide(
+    scenario: Scenario,
+    world: World,
+    nominal: Float[AnyArray, "2 *lanes"],
+    rows: BarrierRows,
+    *,
+    enforced: bool,
+    hard: int,
+    known: Bool[Array, "n *lanes"] | None = None,
+) -> ShieldResult:
+    """The answer of a shield whose rows these are: the first `hard` of them before the others, none at all
+    unless `enforced`. `known` says of each whether it speaks of finite numbers; None asks the world."""
+    nominal = jnp.asarray(nominal, rows.values.dtype)
+    known = known_parts(world) if known is None else known
+    known &= jnp.isfinite(rows.values)
+    if enforced:
+        known &= jnp.isfinite(rows.offsets) & _finite(rows.normals, 1)
+    finite = _finite(nominal)
+    everything = fold(jnp.logical_and, known, True)
+    # With part of the world unknown nothing vouches for the nominal action.
+    vouched = stack(*(jnp.where(everything, component, 0.0) for component in nominal))
+    count = rows.offsets.shape[0] if enforced else 0
+    projection = project(
+        vouched,
+        rows.normals[:count],
+        jnp.where(known, rows.offsets, jnp.nan)[:count],
+        scenario.evader_speed,
+        hard=hard if enforced else 0,
+        circle=scenario.action == "heading",
+    )
+    status = jnp.where(everything, projection.status, Status.INVALID).astype(projection.status.dtype)
+    return ShieldResult(
+        action=projection.action,
+        status=status,
+        barriers=jnp.where(known, rows.values, -jnp.inf),
+        slack=projection.slack,
+        intervention=correction(projection.action, jnp.where(finite, nominal, 0.0)),
+    )
+
+
+def correction(
+    action: Float[AnyArray, "2 *lanes"], nominal: Float[AnyArray, "2 *lanes"]
+) -> Float[Array, "*lanes"]:
+    """|action - nominal| in m/s, for components of `nominal` up to 1e15 m/s; larger ones count as that.
+
+    Beyond, the square of a command, and so every sum of corrections, would be infinite.
+    """
+    x, y = (new - jnp.clip(old, -1e15, 1e15) for new, old in zip(action, nominal, strict=True))
+    return root(x * x + y * y)
+
+
+def as_turned(
+    result: ShieldResult, nominal: Float[AnyArray, "2 *lanes"], turn: Float[AnyArray, "*lanes"]
+) -> ShieldResult:
+    """The answer for a nominal action that was turned aside, as one for the `nominal` action itself."""
+    aside = turn != 0.0
+    moved = correction(result.action, jnp.where(_finite(nominal), nominal, 0.0))
+    return eqx.tree_at(
+        lambda result: (result.status, result.intervention),
+        result,
+        (
+            jnp.where(aside, jnp.maximum(result.status, Status.CORRECTED), result.status),
+            jnp.where(aside, moved, result.intervention),
+        ),
+    )
+
+
+def with_obstacles(
+    barrier: Barrier, scenario: Scenario, world: World, memory: Float[Array, "m *lanes"]
+) -> BarrierRows:
+    """Rows towards all pursuers, then towards all obstacles."""
+    obstacle = ObstacleBarrier()
+    towards_pursuers = barrier.rows(scenario, world, memory)
+    return compose(towards_pursuers, obstacle.rows(scenario, world, obstacle.remember(scenario, world)))

@@ -1,0 +1,87 @@
+"""Every shield and every barrier by name."""
+
+import dataclasses
+import warnings
+
+from sidestep._arrays import traced
+from sidestep.pursuit.game import CaptureGame
+from sidestep.safety.barriers.barrier import Barrier, ObstacleBarrier, RangeBarrier
+from sidestep.safety.barriers.budget import Budget
+from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
+from sidestep.safety.shields.adapted import AdaptedShield, covered, of_control_point
+from sidestep.safety.shields.barrier_shield import shield_of
+from sidestep.safety.shields.game import GameShield
+from sidestep.safety.shields.joint import JointShield
+from sidestep.safety.shields.none import NoShield
+from sidestep.safety.shields.paper import PaperShield
+from sidestep.safety.shields.shield import Shield
+from sidestep.world.model_probe import ModelWarning
+from sidestep.world.scenario import Scenario
+
+SHIELDS: dict[str, type[Shield]] = {
+    "none": NoShield,
+    "paper": PaperShield,
+    "game": GameShield,
+    "joint": JointShield,
+}
+"""Every shield by name."""
+BARRIERS: dict[str, Barrier] = {
+    "obstacle": ObstacleBarrier(),
+    "range": RangeBarrier(),
+    "pursuit": PursuitBarrier(),
+    "pursuit, velocity known": PursuitBarrier(known_velocity=True),
+}
+"""Every barrier by name."""
+BUDGETED: dict[str, type[GameShield] | type[JointShield]] = {"game": GameShield, "joint": JointShield}
+"""Shields that keep a budget."""
+
+
+def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> Shield:
+    """The shield `name` (a key of `SHIELDS`) for a scenario; `budget` for `game` and `joint` only.
+
+    **Raises** `ValueError` naming the known shields, or what is wrong with the budget. **Warns**
+    `BudgetWarning` once where the budget is more than the game leaves, `ModelWarning` where robots of one's
+    own leave an evader that can be caught.
+
+    With robots of one's own (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
+    """
+    if name not in SHIELDS:
+        raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS))}")
+    if not scenario.built_in:
+        guarded = of_control_point(scenario)
+        # The others say nothing of what a pursuer can do.
+        guarded = covered(guarded) if name in BUDGETED else dataclasses.replace(guarded, pursuer_model=None)
+        if name in BUDGETED:
+            _announce_beyond(guarded)
+        return AdaptedShield(scenario, make_shield(name, guarded, budget))
+    if budget is not None:
+        if name not in BUDGETED:
+            raise ValueError(f"the shield {name!r} keeps no budget; use 'game' or 'joint'")
+        budget.announce(scenario)
+    if name == "game":
+        return GameShield(scenario, budget, goes_round=True)
+    return SHIELDS[name](scenario) if budget is None else BUDGETED[name](scenario, budget=budget)
+
+
+def _announce_beyond(guarded: Scenario) -> None:
+    """Warn where a pursuer wins against the problem that covers that of robots of one's own."""
+    if traced(guarded):
+        return
+    allowed, kept = float(CaptureGame.of(guarded).largest_capture_distance), float(guarded.capture_distance)
+    if kept > allowed:
+        speed, axle = float(guarded.pursuer_speed), float(guarded.pursuer_half_axle)
+        warnings.warn(
+            f"with these robots the evader's control point has to keep {kept:.3g} m away from a drive of rim "
+            f"speed {speed:.3g} m/s and half axle {axle:.3g} m, and against a good one {allowed:.3g} m is "
+            "the most: it may be caught. A smaller `offset`, a `covering` drive that can do less, or a "
+            "faster evader would change that",
+            ModelWarning,
+            stacklevel=3,
+        )
+
+
+def as_shield(shield: str | Shield | Barrier, scenario: Scenario) -> Shield:
+    """`shield` itself, the one of that name for `scenario`, or the one that keeps a barrier of one's own."""
+    if isinstance(shield, Barrier):
+        return shield_of(shield, scenario)
+    return make_shield(shield, scenario) if isinstance(shield, str) else shield

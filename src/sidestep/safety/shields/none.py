@@ -1,0 +1,38 @@
+"""The shield `none`: no shield at all, but the speed limit."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+from jaxtyping import Float
+
+from sidestep._arrays import AnyArray
+from sidestep.safety.barriers.barrier import RangeBarrier
+from sidestep.safety.shields.answer import decide, with_obstacles
+from sidestep.safety.shields.shield import Shield, ShieldResult
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+
+@final
+class NoShield(Shield):
+    """Executes the nominal action as it is, cut to the speed limit; reports distances as barriers.
+
+    Status `OK` or `CORRECTED` (by the speed limit), or `INVALID` and a stop for a non-finite action or
+    world.
+    """
+
+    scenario: Scenario
+
+    @property
+    def takes_lanes(self) -> bool:
+        return True
+
+    def init(self, world: World) -> Any:
+        return RangeBarrier().remember(self.scenario, world)
+
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
+        rows = with_obstacles(RangeBarrier(), self.scenario, world, memory)
+        return decide(self.scenario, world, nominal, rows, enforced=False, hard=0), memory

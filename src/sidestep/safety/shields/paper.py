@@ -1,0 +1,39 @@
+"""The shield `paper`: the paper's own, kept as the baseline."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+from jaxtyping import Float
+
+from sidestep._arrays import AnyArray
+from sidestep.safety.barriers.barrier import RangeBarrier
+from sidestep.safety.shields.answer import decide, with_obstacles
+from sidestep.safety.shields.shield import Shield, ShieldResult
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+
+@final
+class PaperShield(Shield):
+    """The paper's shield: `RangeBarrier` towards pursuers, `ObstacleBarrier` towards obstacles.
+
+    Kept as the baseline. Its pursuer row cannot always be kept (see `RangeBarrier`); then the answer
+    violates the pursuers' rows least, and the obstacles' rows least after that.
+    """
+
+    scenario: Scenario
+
+    @property
+    def takes_lanes(self) -> bool:
+        return True
+
+    def init(self, world: World) -> Any:
+        return RangeBarrier().remember(self.scenario, world)
+
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
+        rows = with_obstacles(RangeBarrier(), self.scenario, world, memory)
+        hard = self.scenario.pursuer_count
+        return decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory

@@ -1,0 +1,199 @@
+"""Checkpoints: the whole training state as plain arrays, written whole or not at all.
+
+A checkpoint is one `.npz` file of named arrays without pickled objects, plus a digest of its content; a kill
+at any moment leaves the one before it intact. Only the part of the replay that has been filled is stored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+import warnings
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.store.damage import DamageWarning
+from sidestep.store.files import write_bytes
+from sidestep.store.runs import RunError
+
+_NAME = re.compile(r"episodes-(\d+)\.npz")
+_KEPT = 2
+_MANIFEST = "manifest"
+Tree = TypeVar("Tree")
+
+
+class CheckpointError(RunError):
+    """A checkpoint that cannot be used: damaged, or of another kind of training."""
+
+
+def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return [(jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _plain(leaf: Any) -> np.ndarray:
+    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _rows_of(name: str, rows: dict[str, int]) -> int | None:
+    for prefix, count in rows.items():
+        if name == prefix or name.startswith(prefix + "."):
+            return count
+    return None
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name}:{array.dtype.str}:{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, **about: Any) -> None:
+    """Write a pytree of arrays, whole or not at all, with `about` beside them.
+
+    Of leaves at or below a name in `rows` only that many first rows are kept; reading fills them up again
+    with the example's rows, which may be more than there were.
+    """
+    rows = rows or {}
+    arrays = {name: _plain(leaf)[: _rows_of(name, rows)] if _rows_of(name, rows) is not None else _plain(leaf)
+              for name, leaf in _named_leaves(tree)}  # fmt: skip
+    manifest = json.dumps({**about, "digest": _digest(arrays), "rows": rows})
+    buffer = io.BytesIO()
+    stored: dict[str, Any] = {_MANIFEST: np.frombuffer(manifest.encode(), np.uint8), **_slots(arrays)}
+    np.savez(buffer, **stored)
+    write_bytes(path, buffer.getvalue())
+
+
+def _slots(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    # Pytree paths make poor file names inside a zip; positions with the names beside them do not.
+    names = np.frombuffer(json.dumps(list(arrays)).encode(), np.uint8)
+    return {"names": names, **{f"leaf{i}": array for i, array in enumerate(arrays.values())}}
+
+
+def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays by pytree path, and the manifest. **Raises** `CheckpointError` when the file is damaged."""
+    try:
+        # From memory: NumPy leaves a file that it cannot make sense of open.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            manifest = json.loads(bytes(file[_MANIFEST]))
+            names = json.loads(bytes(file["names"]))
+            arrays = {name: file[f"leaf{i}"] for i, name in enumerate(names)}
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} does not exist") from None
+    except Exception as error:
+        # Damage shows as whatever the first broken byte leads NumPy, zip or JSON into.
+        raise CheckpointError(f"{path} is damaged: {error or type(error).__name__}") from None
+    if _digest(arrays) != manifest.get("digest"):
+        raise CheckpointError(f"{path} is damaged: its digest differs from its content's")
+    return arrays, manifest
+
+
+def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
+    """The pytree that `write_arrays` stored, shaped like `example`, and what was stored beside it.
+
+    **Raises** `CheckpointError` when the file is damaged or does not fit `example`.
+    """
+    arrays, manifest = read_named(path)
+    leaves = []
+    for name, leaf in _named_leaves(example):
+        wanted = _plain(leaf)
+        if name not in arrays:
+            raise CheckpointError(
+                f"{path} lacks {name}: it was written by another version or with other options"
+            )
+        array = arrays.pop(name)
+        if _rows_of(name, manifest["rows"]) is not None and array.shape[1:] == wanted.shape[1:]:
+            array = np.concatenate([array, wanted[len(array) :]])
+        if array.shape != wanted.shape or array.dtype != wanted.dtype:
+            raise CheckpointError(
+                f"{path}: {name} is {array.dtype}{list(array.shape)}, but {wanted.dtype}"
+                f"{list(wanted.shape)} is needed: it was written with another scenario, other options or "
+                "another float precision"
+            )
+        value = jnp.asarray(array)
+        if _is_key(leaf):
+            value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
+        leaves.append(value)
+    if arrays:
+        raise CheckpointError(f"{path} holds {', '.join(list(arrays)[:3])} that this version does not know")
+    return jax.tree.unflatten(jax.tree.structure(example), leaves), manifest
+
+
+def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> Path:
+    """Write the training state after the episodes it has seen; the two newest checkpoints are kept."""
+    folder = Path(folder) / "checkpoints"
+    episodes = int(state.episodes)
+    folder.mkdir(exist_ok=True)
+    path = folder / f"episodes-{episodes:06d}.npz"
+    filled = min(int(state.replay.written), state.replay.capacity)
+    write_arrays(
+        path,
+        state,
+        rows={
+            ".replay.transitions": filled,
+            ".replay.episode": filled,
+            ".replay.episode_last": min(episodes + 1, state.replay.capacity),
+        },
+        episodes=episodes,
+        wall_seconds=wall_seconds,
+    )
+    for old in list_checkpoints(folder.parent)[:-_KEPT]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def list_checkpoints(folder: str | Path) -> list[Path]:
+    """Checkpoints of a run, oldest first."""
+    found = [path for path in (Path(folder) / "checkpoints").glob("*.npz") if _NAME.fullmatch(path.name)]
+    return sorted(found, key=_episodes_of)
+
+
+def _episodes_of(path: Path) -> int:
+    return int(_NAME.fullmatch(path.name).group(1))  # type: ignore[union-attr]
+
+
+def read_checkpoint(folder: str | Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
+    """The newest checkpoint of a run that is whole.
+
+    One that is damaged on disk falls back on the one before it, with a `DamageWarning` that says which file
+    is damaged, from which episode the run goes on, and what was lost.
+
+    **Raises** `CheckpointError` when there is none, or none that fits `example`.
+    """
+    problems: list[CheckpointError] = []
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            found = read_arrays(path, example)
+        except CheckpointError as error:
+            problems.append(error)
+            continue
+        if problems:
+            begin, lost = _episodes_of(path), _episodes_of(list_checkpoints(folder)[-1]) - _episodes_of(path)
+            warnings.warn(
+                f"{'; '.join(map(str, problems))}. The training goes on from {path.name}, after episode "
+                f"{begin}. Lost: the {lost} episodes after it, which are trained again (the same seed gives "
+                "the same episodes)",
+                DamageWarning,
+                stacklevel=2,
+            )
+        return found
+    if not problems:
+        raise CheckpointError(f"{folder} has no checkpoint any more; start another run with --out")
+    if len(problems) > 1:
+        raise CheckpointError(
+            f"{'; '.join(map(str, problems))}. No older checkpoint is left: start another run with --out"
+        )
+    raise problems[0]
