@@ -20,7 +20,7 @@ PAGES ?= README.md docs ros2/sidestep_ros/README.md
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce play test test-ros test-pages test-wheel check format wheel lock lock-ros docs bench clean
+.PHONY: help setup reproduce play test test-all test-ros test-pages test-wheel check format wheel lock lock-ros docs bench clean
 
 help: ## This list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -64,6 +64,10 @@ play: $(READY) ## Serve the page in which you try to catch the robot
 
 test: $(READY_DEV) ## Run the tests (those marked slow: make test ARGS='-m slow')
 	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow and not wheel" $(ARGS)
+
+# An empty XLA_FLAGS leaves the compiler's level as users have it; conftest.py lowers it otherwise.
+test-all: $(READY_DEV) ## Run every test, those marked slow too, compiled as users have it (an hour on two cores)
+	XLA_FLAGS= $(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not wheel" $(ARGS)
 
 test-ros: $(ROS_READY) ## Types and tests of the ROS 2 package, with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
 	$(PY) -m pyright -p ros2

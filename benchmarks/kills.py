@@ -56,7 +56,7 @@ import inspect, sys
 from sidestep._compiled import keep_compiled_programs
 keep_compiled_programs()
 import sidestep.learning
-inspect.unwrap(sys.modules["sidestep.learning.train"].train).__kwdefaults__["checkpoint_seconds"] = 0.2
+inspect.unwrap(sys.modules["sidestep.learning.run"].train).__kwdefaults__["checkpoint_seconds"] = 0.2
 from sidestep.cli import main
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

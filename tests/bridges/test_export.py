@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from sidestep.bridges.export import export_jax, export_onnx
-from sidestep.learning.networks import Actor
-from sidestep.learning.policy import LearnedPolicy, write_policy
+from sidestep.learning import Actor, LearnedPolicy, write_policy
 from sidestep.loop.step import decide
 from sidestep.safety import Budget, GameShield, Status, make_shield
 from sidestep.store.runs import create_run

@@ -177,7 +177,7 @@ def test_run_killed_before_its_first_checkpoint_and_again_before_its_next_goes_o
     def kill(*_, **__):
         raise Killed
 
-    monkeypatch.setattr(sys.modules["sidestep.learning.train"], "write_checkpoint", kill)
+    monkeypatch.setattr(sys.modules["sidestep.learning.run"], "write_checkpoint", kill)
     with pytest.raises(Killed):
         small.train(out=tmp_path / "run")
     monkeypatch.undo()
@@ -381,7 +381,7 @@ def test_two_strategies_of_ones_own_are_not_taken_for_each_other(small, tmp_path
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys.modules["sidestep.learning.train"], "run_chunk", stop)
+    monkeypatch.setattr(sys.modules["sidestep.learning.run"], "run_chunk", stop)
     assert small.train(pursuer=timid, out=tmp_path / "run").interrupted
     with pytest.raises(RunError, match=r"pursuer.*timid.*bold"):
         small.train(pursuer=bold, out=tmp_path / "run", resume=True)

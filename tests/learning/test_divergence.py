@@ -9,11 +9,13 @@ import pytest
 from sidestep._arrays import real
 from sidestep.learning.divergence import Diverged, broken_networks, divergence
 from sidestep.learning.td3 import Losses
-from sidestep.learning.training import Report, Tally, run_chunk, start
+from sidestep.learning.training import Report, run_chunk, start
+from sidestep.loop import Tally
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.store.checkpoints import CheckpointError, list_checkpoints, read_checkpoint, write_checkpoint
 from sidestep.store.runs import read_metrics, read_summary
+from sidestep.world import load_scenario
 
 WILD = 1e30
 """A learning rate that no network survives."""
@@ -40,7 +42,7 @@ def test_an_actor_that_answers_nan_is_invalid_input_in_training_too_not_a_stop(s
     np.testing.assert_array_equal(invalid[later], np.asarray(report.tally.steps)[later])
     assert np.all(invalid > 0)
     # The robots went on moving with finite numbers.
-    assert np.all(np.isfinite(after.world.evader))
+    assert np.all(np.isfinite(after.episode.world.evader))
     assert divergence(report, after.learner, 3) == (4, "the action that the actor asked for is")
 
 
@@ -85,13 +87,14 @@ def test_checkpoint_with_broken_networks_is_not_trained_on(small, tmp_path):
 
 def report_of(ended, critic=None, finite=None):
     """What a chunk of decisions reports in which episodes ended, critics lost and actions were like this."""
-    count, none = len(ended), jnp.zeros((), int)
+    count, none = len(ended), jnp.zeros((), jnp.int32)
+    tally = Tally.zero(load_scenario("paper").reset(jax.random.key(0)))
     critic = [0.0] * count if critic is None else critic
     finite = [True] * count if finite is None else finite
 
     def decision(ended, critic, finite):
         losses = Losses(real(critic), real(0.0), real(0.0))
-        return Report(jnp.asarray(ended), none, Tally.init(), none, losses, jnp.asarray(finite))
+        return Report(jnp.asarray(ended), none, tally, none, losses, jnp.asarray(finite))
 
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(decision, ended, critic, finite))
 

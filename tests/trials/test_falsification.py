@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from sidestep.cli import main
-from sidestep.learning import LearnedPolicy
-from sidestep.learning.networks import Actor
+from sidestep.learning import Actor, LearnedPolicy
 from sidestep.safety import PaperShield, make_shield
 from sidestep.store.runs import read_metrics
 from sidestep.trials.falsification import (

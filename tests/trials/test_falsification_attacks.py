@@ -236,7 +236,7 @@ def test_planned_attack_drives_what_it_planned():
     chases, wheels = chase_with_plans(UNSHIELDED, PLANNING, starts, knots, 32, "capture", jax.random.key(3))
     assert np.any(np.asarray(chases.outcome) == 0)
     for number in range(3):
-        steps = int(chases.steps[number])
+        steps = int(chases.tally.steps[number])
         world = jax.tree.map(lambda leaf, number=number: np.asarray(leaf[number]), starts)
         driven = wheels[number, :steps]
         alone = play(EMPTY, UNSHIELDED.policy, UNSHIELDED.shield, world, driven, 32)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.learning.td3 import TD3
+from sidestep.learning import TD3
 from sidestep.loop.step import RUNNING
 from sidestep.safety import make_shield
 from sidestep.store.checkpoints import read_named
@@ -29,7 +29,7 @@ def test_learning_pursuer_learns_from_every_period_that_counts():
     pupil = new_pupil(lessons, jax.random.key(0))
     starts = draw_starts(EMPTY, jax.random.split(jax.random.key(1), 4), np.array([True, True, False, False]))
     taught, chases, wheels = lesson(UNSHIELDED, lessons, pupil, starts, "capture", jax.random.key(2))
-    steps = np.asarray(chases.steps)
+    steps = np.asarray(chases.tally.steps)
     assert wheels.shape == (4, 12, 1, 2)
     assert int(taught.ring.written) == np.sum(-(-steps // 2))
     assert int(taught.learner.updates) > 0

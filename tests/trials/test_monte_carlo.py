@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import whole_number
-from sidestep.loop import episode_key, rollout
+from sidestep.loop import crew, episode_key, rollout
 from sidestep.store.runs import OUTCOMES
-from sidestep.trials import Evaluation, crew, evaluate, monte_carlo
+from sidestep.trials import Evaluation, evaluate, monte_carlo
 from sidestep.world import goal_seeking, load_scenario
 
 # Crowded and short, so that every outcome occurs.

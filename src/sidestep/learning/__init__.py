@@ -1,15 +1,19 @@
 """What the evader learns: TD3, replay, the training loop, checkpoints, the policy it leaves."""
 
 from sidestep.learning.divergence import Diverged
+from sidestep.learning.networks import Actor
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
-from sidestep.learning.policy import LearnedPolicy, load_policy
-from sidestep.learning.td3 import TD3
-from sidestep.learning.train import Progress, Training, resume_settings, train
+from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
+from sidestep.learning.run import Progress, Training, resume_settings, train
+from sidestep.learning.td3 import TD3, Batch, Learner, update
 
 __all__ = [
     "TD3",
+    "Actor",
+    "Batch",
     "Diverged",
     "LearnedPolicy",
+    "Learner",
     "Progress",
     "Training",
     "TrainingOptions",
@@ -18,4 +22,6 @@ __all__ = [
     "options_to_dict",
     "resume_settings",
     "train",
+    "update",
+    "write_policy",
 ]

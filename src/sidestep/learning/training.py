@@ -2,43 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Count, Flag, Scalar, real
+from sidestep._arrays import Count, Scalar, real, select
 from sidestep.learning.bounds import on_disc, through_shield
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Learner, Losses, update
-from sidestep.loop.step import RUNNING, control_step, nominal_velocity, outcome_of
-from sidestep.pursuit import without_answer
-from sidestep.safety.filter.status import Status
-from sidestep.world import Scenario, World, observation_size, observe
-
-
-class Tally(eqx.Module):
-    """What one episode has come to so far. Clearances in m, correction in m/s summed over periods; periods
-    that the shield corrected, those of them with rows that could not hold, and with input not finite, and
-    periods in which a pursuer's wheel speeds were not finite."""
-
-    total_reward: Scalar
-    steps: Count
-    pursuer_clearance: Scalar
-    obstacle_clearance: Scalar
-    interventions: Count
-    infeasible: Count
-    invalid: Count
-    pursuer_invalid: Count
-    correction: Scalar
-
-    @classmethod
-    def init(cls) -> Tally:
-        zero, count, far = real(0.0), jnp.zeros((), int), real(jnp.inf)
-        return cls(zero, count, far, far, count, count, count, count, zero)
+from sidestep.loop.episode import Episode, Tally, Task, advance, begin, hold
+from sidestep.loop.step import CAPTURED, COLLIDED, nominal_velocity
+from sidestep.world import Scenario, observation_size, observe
 
 
 class TrainState(eqx.Module):
@@ -46,9 +24,7 @@ class TrainState(eqx.Module):
 
     learner: Learner
     replay: Replay
-    world: World
-    memory: Any
-    tally: Tally
+    episode: Episode
     key: PRNGKeyArray
     episodes: Count
     decisions: Count
@@ -67,18 +43,14 @@ class Report(eqx.Module):
     finite: Bool[Array, "..."]
 
 
-class _Drive(eqx.Module):
-    """Carry of the control periods within one decision."""
+class _Drive(NamedTuple):
+    """One decision: the episode after it, the sums of the actions executed and of their corrections (m/s),
+    and the evader's `path`."""
 
-    world: World
-    memory: Any
-    tally: Tally
-    alive: Flag
-    lost: Flag
-    outcome: Count
-    steps: Count
+    end: Episode
     executed: Float[Array, "2"]
     correction: Scalar
+    path: Float[Array, "knots 2"]
 
 
 @eqx.filter_jit
@@ -105,9 +77,7 @@ def start(
     return TrainState(
         learner=options.algorithm.init(observation_size(scenario), 2, net_key),
         replay=Replay.init(example, capacity),
-        world=world,
-        memory=shield.init(world),
-        tally=Tally.init(),
+        episode=begin(shield, world),
         key=key,
         episodes=jnp.zeros((), int),
         decisions=jnp.zeros((), int),
@@ -116,58 +86,22 @@ def start(
 
 
 def _drive(
-    scenario: Scenario,
-    shield: Any,
-    pursuer: Any,
-    options: TrainingOptions,
-    state: TrainState,
-    nominal: Float[Array, "2"],
-    key: PRNGKeyArray,
-) -> tuple[_Drive, Float[Array, "knots 2"]]:
-    """Hold the nominal velocity for a decision; nothing moves any more once the episode has ended."""
+    task: Task, options: TrainingOptions, episode: Episode, nominal: Float[Array, "2"], key: PRNGKeyArray
+) -> _Drive:
+    """Hold the nominal velocity for a decision, or until the episode ends."""
 
-    def period(carry: _Drive, key: PRNGKeyArray) -> tuple[_Drive, Float[Array, "2"]]:
-        world, memory, events, result, wheels = control_step(
-            scenario, shield, pursuer, carry.world.set_apart(~carry.alive), carry.memory, nominal, key
-        )
-        tally = carry.tally
-        moved = _Drive(
-            world=world,
-            memory=memory,
-            tally=Tally(
-                total_reward=tally.total_reward + events.reward,
-                steps=tally.steps + 1,
-                pursuer_clearance=jnp.minimum(tally.pursuer_clearance, events.pursuer_clearance),
-                obstacle_clearance=jnp.minimum(tally.obstacle_clearance, events.obstacle_clearance),
-                interventions=tally.interventions + (result.status != Status.OK).astype(tally.steps.dtype),
-                infeasible=tally.infeasible + (result.status == Status.INFEASIBLE).astype(tally.steps.dtype),
-                invalid=tally.invalid + (result.status == Status.INVALID).astype(tally.steps.dtype),
-                pursuer_invalid=tally.pursuer_invalid + without_answer(wheels).astype(tally.steps.dtype),
-                correction=tally.correction + result.intervention,
-            ),
-            alive=~(events.terminated | events.truncated),
-            lost=events.captured | events.collided,
-            outcome=outcome_of(events),
-            steps=carry.steps + 1,
-            executed=carry.executed + result.action,
-            correction=carry.correction + result.intervention,
-        )
-        carry = jax.tree.map(lambda new, old: jnp.where(carry.alive, new, old), moved, carry)
-        return carry, carry.world.evader
+    def period(carry: tuple[Episode, Array, Array], key: PRNGKeyArray) -> tuple[Any, Float[Array, "2"]]:
+        episode, *sums = carry
+        episode, period = advance(task, episode, key)
+        result = period.result
+        more = [total + one for total, one in zip(sums, (result.action, result.intervention), strict=True)]
+        return (episode, *select(period.running, more, sums)), episode.world.evader
 
-    begin = _Drive(
-        world=state.world,
-        memory=state.memory,
-        tally=state.tally,
-        alive=jnp.asarray(True),
-        lost=jnp.asarray(False),
-        outcome=jnp.asarray(RUNNING, jnp.int32),
-        steps=jnp.asarray(0),
-        executed=jnp.zeros_like(nominal),
-        correction=real(0.0),
+    begun = (hold(episode, nominal), jnp.zeros_like(nominal), real(0.0))
+    (end, executed, correction), places = jax.lax.scan(
+        period, begun, jax.random.split(key, options.decision_steps)
     )
-    end, places = jax.lax.scan(period, begin, jax.random.split(key, options.decision_steps))
-    return end, jnp.concatenate([state.world.evader[None], places])
+    return _Drive(end, executed, correction, jnp.concatenate([episode.world.evader[None], places]))
 
 
 def _learn(
@@ -210,27 +144,29 @@ def decide_and_learn(
     an episode wherever its chunks end.
     """
     active = state.episodes < limit
+    world, task = state.episode.world, Task(scenario, None, shield, pursuer)
     key, noise_key, random_key, drive_key, learn_key, reset_key = jax.random.split(state.key, 6)
 
-    wanted = state.learner.actor(observe(scenario, state.world)[None])[0]
+    wanted = state.learner.actor(observe(scenario, world)[None])[0]
     noise = options.exploration_noise * jax.random.normal(noise_key, (2,), dtype=float)
     explored = jnp.clip(wanted + noise, -1.0, 1.0)
     anything = jax.random.uniform(random_key, (2,), dtype=float, minval=-1.0, maxval=1.0)
     warm = state.decisions < options.warmup_decisions
-    nominal = nominal_velocity(scenario, state.world, jnp.where(warm, anything, explored))
+    nominal = nominal_velocity(scenario, world, jnp.where(warm, anything, explored))
 
-    end, path = _drive(scenario, shield, pursuer, options, state, nominal, drive_key)
-    periods = end.steps.astype(nominal.dtype)
+    drive = _drive(task, options, state.episode, nominal, drive_key)
+    end, steps = drive.end, drive.end.tally.steps - state.episode.tally.steps
+    periods = steps.astype(nominal.dtype)
     replay = state.replay.add(
         Transition(
-            world=state.world,
+            world=world,
             next_world=end.world,
-            path=path,
-            steps=end.steps,
+            path=drive.path,
+            steps=steps.astype(int),
             proposed=nominal,
-            executed=end.executed / periods,
-            correction=end.correction / periods,
-            lost=end.lost,
+            executed=drive.executed / periods,
+            correction=drive.correction / periods,
+            lost=(end.outcome == CAPTURED) | (end.outcome == COLLIDED),
         ),
         state.episodes,
         active,
@@ -242,19 +178,13 @@ def decide_and_learn(
         state.learner,
     )
 
-    ended = ~end.alive
-    fresh = scenario.reset(reset_key)
-    begun = (fresh, shield.init(fresh), Tally.init())
-    world, memory, tally = jax.tree.map(
-        lambda new, old: jnp.where(ended, new, old), begun, (end.world, end.memory, end.tally)
-    )
-    env_steps = state.env_steps + end.steps
+    ended = ~end.running
+    episode = select(ended, begin(shield, scenario.reset(reset_key)), end)
+    env_steps = state.env_steps + steps.astype(state.env_steps.dtype)
     moved = TrainState(
         learner=learner,
         replay=replay,
-        world=world,
-        memory=memory,
-        tally=tally,
+        episode=episode,
         key=key,
         episodes=state.episodes + ended.astype(state.episodes.dtype),
         decisions=state.decisions + 1,

@@ -1,9 +1,10 @@
-"""How does an episode run? One control step, policies, random keys, recorded trajectories."""
+"""How does an episode run? One control period, one episode, policies, random keys, recordings."""
 
+from sidestep.loop.episode import Episode, Period, Tally, Task, advance, ask, begin, hold
 from sidestep.loop.keys import episode_key
 from sidestep.loop.policies import as_policy
 from sidestep.loop.rollout import (
-    Episode,
+    Recording,
     Trajectory,
     load_episode,
     load_trajectory,
@@ -13,9 +14,17 @@ from sidestep.loop.rollout import (
 
 __all__ = [
     "Episode",
+    "Period",
+    "Recording",
+    "Tally",
+    "Task",
     "Trajectory",
+    "advance",
     "as_policy",
+    "ask",
+    "begin",
     "episode_key",
+    "hold",
     "load_episode",
     "load_trajectory",
     "rollout",

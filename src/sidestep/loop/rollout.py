@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import whole_number
+from sidestep.loop.episode import Episode, Task, advance, ask_in_time, begin
 from sidestep.loop.keys import as_key, start_and_pursuit
 from sidestep.loop.policies import as_policy
-from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.loop.step import RUNNING, outcome_of
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import Shield, as_shield
 from sidestep.store.files import json_safe, write_bytes
@@ -67,56 +68,36 @@ class Trajectory(eqx.Module):
 
 
 @eqx.filter_jit
-def _record(
-    scenario: Scenario,
-    policy: Callable[..., Any],
-    shield: Any,
-    pursuer: Callable[..., Any],
-    world: World,
-    key: PRNGKeyArray,
-    steps: int,
-) -> tuple[Int[Array, ""], Trajectory]:
+def _record(task: Task, world: World, key: PRNGKeyArray, steps: int) -> tuple[Int[Array, ""], Trajectory]:
     """Record until the episode ends, or for `steps` periods; what lies beyond the returned length is zero."""
-    decision_steps = decision_steps_of(policy)
 
-    def period(count: Array, world: World, memory: Any, held: Array) -> tuple[World, Any, Trajectory]:
-        nominal = jax.lax.cond(
-            count % decision_steps == 0, lambda: decide(scenario, policy, world), lambda: held
-        )
-        moved, memory, events, result, wheels = control_step(
-            scenario, shield, pursuer, world, memory, nominal, jax.random.fold_in(key, count)
-        )
-        return (
-            moved,
-            memory,
-            Trajectory(
-                worlds=moved,
-                nominal=nominal,
-                action=result.action,
-                wheel_speeds=wheels,
-                status=result.status,
-                barriers=result.barriers,
-                slack=result.slack,
-                intervention=result.intervention,
-                events=events,
-            ),
+    def period(count: Array, episode: Episode) -> tuple[Episode, Trajectory]:
+        episode, period = advance(task, ask_in_time(task, episode, count), jax.random.fold_in(key, count))
+        result = period.result
+        return episode, Trajectory(
+            worlds=period.after,
+            nominal=period.nominal,
+            action=result.action,
+            wheel_speeds=period.wheel_speeds,
+            status=result.status,
+            barriers=result.barriers,
+            slack=result.slack,
+            intervention=result.intervention,
+            events=period.events,
         )
 
-    def running(carry: tuple[Any, ...]) -> Array:
-        count, outcome, *_ = carry
-        return (count < steps) & (outcome == RUNNING)
+    def more(carry: tuple[Array, Episode, Trajectory]) -> Array:
+        return (carry[0] < steps) & carry[1].running
 
-    def store(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        count, _, world, memory, held, record = carry
-        world, memory, entry = period(count, world, memory, held)
-        record = jax.tree.map(lambda whole, one: whole.at[count].set(one), record, entry)
-        return count + 1, outcome_of(entry.events), world, memory, entry.nominal, record
+    def store(carry: tuple[Array, Episode, Trajectory]) -> tuple[Array, Episode, Trajectory]:
+        count, episode, record = carry
+        episode, entry = period(count, episode)
+        return count + 1, episode, jax.tree.map(lambda whole, one: whole.at[count].set(one), record, entry)
 
-    begin = (jnp.zeros((), jnp.int32), world, shield.init(world), jnp.zeros_like(world.evader))
-    shapes = eqx.filter_eval_shape(period, *begin)[2]
+    count, episode = jnp.zeros((), jnp.int32), begin(task.shield, world)
+    shapes = eqx.filter_eval_shape(period, count, episode)[1]
     record = jax.tree.map(lambda leaf: jnp.zeros((steps, *leaf.shape), leaf.dtype), shapes)
-    carry = (begin[0], jnp.full((), RUNNING, jnp.int32), *begin[1:], record)
-    count, *_, record = jax.lax.while_loop(running, store, carry)
+    count, _, record = jax.lax.while_loop(more, store, (count, episode, record))
     worlds = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world, record.worlds)
     return count, eqx.tree_at(lambda record: record.worlds, record, worlds)
 
@@ -151,7 +132,7 @@ def rollout(
     pursuer = as_pursuer(pursuer)
     start_key, pursuit_key = start_and_pursuit(as_key(key))
     world = _reset(scenario, start_key) if world is None else world
-    count, record = _record(scenario, policy, shield, pursuer, world, pursuit_key, steps)
+    count, record = _record(Task(scenario, policy, shield, pursuer), world, pursuit_key, steps)
     length = int(count)
     # Cut on the host: JAX would compile one slice per leaf for every new length.
     cut = lambda leaf, end: jnp.asarray(np.asarray(leaf)[:end])  # noqa: E731
@@ -166,7 +147,7 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Episode:
+class Recording:
     """A trajectory with the `scenario` it was recorded in (None: nobody said) and what else to say of it."""
 
     trajectory: Trajectory
@@ -205,7 +186,7 @@ def _without_code(scenario: Mapping[str, Any]) -> dict[str, Any]:
     return {**scenario, **nameless}
 
 
-def load_episode(path: str | Path) -> Episode:
+def load_episode(path: str | Path) -> Recording:
     """What `save_trajectory` wrote, with what it was told. **Raises** as `load_trajectory`."""
     try:
         with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
@@ -221,6 +202,6 @@ def load_episode(path: str | Path) -> Episode:
         # Custom robots that have no name are code, and what was recorded needs none of it. Those with a name
         # are kept: the sets that figures draw depend on them.
         scenario = load_scenario("paper", **_without_code(told["scenario"])) if told else None
-        return Episode(trajectory, scenario, told.get("about", {}))
+        return Recording(trajectory, scenario, told.get("about", {}))
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} holds no recorded trajectory: {error}") from error

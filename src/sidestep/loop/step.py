@@ -35,6 +35,8 @@ def decision_steps_of(policy: object) -> int:
 
 RUNNING = -1
 """Outcome of an episode that has not ended."""
+CAPTURED, COLLIDED, REACHED, TIMED_OUT = range(4)
+"""Outcomes of one that has, as indices into `store.runs.OUTCOMES`."""
 
 
 def outcome_of(events: Events) -> Int[Array, "*lanes"]:

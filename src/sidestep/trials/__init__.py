@@ -39,7 +39,6 @@ __getattr__ = moved_names(
     __name__,
     dict.fromkeys(
         (
-            "Episode",
             "Trajectory",
             "as_policy",
             "episode_key",

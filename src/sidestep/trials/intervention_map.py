@@ -8,10 +8,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from sidestep.safety import ShieldResult, Status
-from sidestep.world import Scenario, World
+from sidestep.loop.episode import Period
+from sidestep.safety import Status
+from sidestep.world import Scenario
 from sidestep.world.capture_geometry import to_pursuer_frame
 
 CELLS = 75
@@ -83,19 +84,13 @@ def no_periods() -> Float[Array, "cells_and_one 6"]:
 
 
 def add_periods(
-    sums: Float[Array, "cells_and_one 6"],
-    scenario: Scenario,
-    world: World,
-    nominal: Float[Array, "2 lanes"],
-    result: ShieldResult,
-    running: Bool[Array, "lanes"],
+    sums: Float[Array, "cells_and_one 6"], scenario: Scenario, period: Period
 ) -> Float[Array, "cells_and_one 6"]:
-    """Count one control period of each lane that is `running`. To be traced.
+    """Count one control period of each lane that is running: what `loop.crew` reads. To be traced.
 
     Single precision holds counts up to 2^24: take the sums out before that many periods.
-
-    **Arguments:** `world` in which the period began, with lanes.
     """
+    world, nominal, result, running = period.world, period.nominal, period.result, period.running
     offsets = world.pursuers[:, :2] - world.evader
     nearest = jnp.argmin(jnp.sum(offsets**2, axis=1), axis=0)
     pose = jnp.take_along_axis(world.pursuers, nearest[None, None], axis=0)[0]

@@ -11,15 +11,16 @@ from jaxtyping import PRNGKeyArray
 
 from sidestep._arrays import whole_number
 from sidestep._threads import side_by_side, useful_threads
+from sidestep.loop.crew import Crew, Trial
+from sidestep.loop.episode import Task
 from sidestep.loop.keys import as_key
 from sidestep.loop.policies import HostPolicy, as_policy
 from sidestep.loop.step import decision_steps_of
 from sidestep.pursuit import as_pursuer
 from sidestep.pursuit.foreign import runs_on_host
 from sidestep.safety import Shield, as_shield
-from sidestep.trials.crew import COLLECTED, Crew, Trial
 from sidestep.trials.evaluation import Evaluation
-from sidestep.trials.intervention_map import InterventionMap, map_reach
+from sidestep.trials.intervention_map import InterventionMap, add_periods, map_reach, no_periods
 from sidestep.world import Scenario
 
 _WHOLE = 16
@@ -69,7 +70,9 @@ def evaluate(
     most = 1 if asked else min(episodes, max(1, batch // _LEAST_WIDTH))
     threads = useful_threads(most if threads is None else min(most, whole_number("threads", threads)))
     width = batch if threads == 1 else -(-batch // (threads * _WHOLE)) * _WHOLE
-    trial = Trial(scenario, policy, as_shield(shield, scenario), pursuer, as_key(key), width, mapped)
+    task = Task(scenario, policy, as_shield(shield, scenario), pursuer)
+    reading = {"kept": no_periods(), "read": add_periods} if mapped else {}
+    trial = Trial(task, as_key(key), width, **reading)
     shares = [episodes * share // threads for share in range(threads + 1)]
     crews = [Crew(trial, *share) for share in pairwise(shares)]
     if threads > 1:
@@ -84,7 +87,7 @@ def evaluate(
             progress(finished, episodes)
 
     side_by_side(crews, tell)
-    results = {name: np.concatenate([crew.results[name] for crew in crews]) for name in COLLECTED}
+    results = {name: np.concatenate([crew.results[name] for crew in crews]) for name in crews[0].results}
     where = None
     if mapped:
         where = InterventionMap.of_sums(

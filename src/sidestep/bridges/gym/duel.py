@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from sidestep._arrays import seed_number
 from sidestep._packages import needed
 from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
-from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
+from sidestep.bridges.gym.episode import EnvState, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
@@ -81,7 +81,7 @@ def _pursuer_space(scenario: Scenario) -> spaces.Box:
     return spaces.Box(-high, high, dtype=np.float32)
 
 
-def _all_seen(task: Task, episode: Episode) -> tuple[Any, Any]:
+def _all_seen(task: Task, episode: EnvState) -> tuple[Any, Any]:
     views = [
         pursuer_observation(task.scenario, episode.world.seen_by(index))
         for index in range(task.scenario.pursuer_count)
@@ -99,7 +99,7 @@ def _begin_in(task: Task, world: World, words: Any, number: Any) -> tuple[Any, .
     return jax.tree.leaves(episode), *_all_seen(task, episode)
 
 
-def _step(task: Task, episode: Episode, action: Any, wheels: Any) -> tuple[Any, ...]:
+def _step(task: Task, episode: EnvState, action: Any, wheels: Any) -> tuple[Any, ...]:
     told = _Told(task.scenario.pursuer_speed * wheels)
     episode, made = decide(eqx.tree_at(lambda task: task.pursuer, task, told), episode, action)
     return jax.tree.leaves(episode), *_all_seen(task, episode), *packed(made)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sidestep._arrays import seed_number
 from sidestep.bridges.gym.calls import bundle_of, bundled, flat, packed, seed_words, unpacked_one
-from sidestep.bridges.gym.episode import Episode, begin, begin_in, decide, seen
+from sidestep.bridges.gym.episode import EnvState, begin, begin_in, decide, seen
 from sidestep.bridges.gym.rendering import Screen, check_render_mode
 from sidestep.bridges.gym.spaces import action_space, checked_action, observation_space
 from sidestep.bridges.gym.task import Task, make_task
@@ -29,7 +29,7 @@ def _begin_in(task: Task, world: World, words: Any, number: Any) -> tuple[list[A
     return jax.tree.leaves(episode), seen(task, episode)
 
 
-def _step(task: Task, episode: Episode, action: Any) -> tuple[list[Any], Any, Any, Any]:
+def _step(task: Task, episode: EnvState, action: Any) -> tuple[list[Any], Any, Any, Any]:
     episode, made = decide(task, episode, action)
     return jax.tree.leaves(episode), seen(task, episode), *packed(made)
 

@@ -14,17 +14,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from sidestep._arrays import AnyArray, Lanes, lane_by_lane, real, select
-from sidestep.bridges.gym.task import Task
+from sidestep.bridges.gym.task import Task as GymTask
+from sidestep.loop.episode import Task, advance, continued, hold
 from sidestep.loop.keys import episode_key, start_and_pursuit
-from sidestep.loop.step import control_step, nominal_velocity
-from sidestep.pursuit import without_answer
-from sidestep.safety import start_in_lanes
+from sidestep.loop.step import nominal_velocity
+from sidestep.safety import Status, start_in_lanes
 from sidestep.world import World, observe, to_action
 from sidestep.world.robots import limit_speed
 
 
-class Episode(eqx.Module):
-    """Where an episode is.
+class EnvState(eqx.Module):
+    """Where the episode of an environment is, between two decisions.
 
     **Attributes:** `world`, the shield's `memory`, the two `words` of the environment's random key, the
     `number` of the episode, the control `periods` that it has lasted.
@@ -69,7 +69,7 @@ def _keys(words: Any, number: Any) -> tuple[Any, Any]:
     return start_and_pursuit(episode_key(jax.random.wrap_key_data(words), number))
 
 
-def begin(task: Task, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray, "*lanes"]) -> Episode:
+def begin(task: GymTask, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray, "*lanes"]) -> EnvState:
     """The start of episode `number` of the environment with these words for a random key."""
     lanes = number.ndim
     world = lane_by_lane(lambda *of: task.scenario.reset(_keys(*of)[0]), lanes, words, number)
@@ -77,16 +77,18 @@ def begin(task: Task, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray,
 
 
 def begin_in(
-    task: Task, world: World, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray, "*lanes"]
-) -> Episode:
+    task: GymTask, world: World, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray, "*lanes"]
+) -> EnvState:
     """The same, but in a given world."""
     number = jnp.asarray(number, jnp.int32)
-    return Episode(
+    return EnvState(
         world, start_in_lanes(task.shield, world), jnp.asarray(words), number, jnp.zeros_like(number)
     )
 
 
-def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) -> tuple[Episode, Decision]:
+def decide(
+    task: GymTask, episode: EnvState, action: Float[AnyArray, "2 *lanes"]
+) -> tuple[EnvState, Decision]:
     """Hold an action in [-1, 1]^2 for `task.decision_steps` control periods, or until the episode ends.
 
     The velocity that it asks for stays the same in world axes; the shield corrects it in every period.
@@ -96,61 +98,39 @@ def decide(task: Task, episode: Episode, action: Float[AnyArray, "2 *lanes"]) ->
     nominal, finite = nominal_velocity(scenario, start, action), jnp.all(jnp.isfinite(action), axis=0)
     # Unused, and so not computed, where the pursuer draws nothing.
     keys = lane_by_lane(lambda *of: _keys(*of)[1], start.lanes, episode.words, episode.number)
+    run = Task(scenario, None, task.shield, task.pursuer)
 
-    def period(episode: Episode, apart: Any) -> tuple[Episode, Decision]:
-        key = lane_by_lane(jax.random.fold_in, start.lanes, keys, episode.periods)
-        world = episode.world if apart is None else episode.world.set_apart(apart)
-        world, memory, events, result, wheels = control_step(
-            scenario, task.shield, task.pursuer, world, episode.memory, nominal, key
-        )
-        moved = Episode(world, memory, episode.words, episode.number, episode.periods + 1)
-        return moved, Decision(
-            reward=task.reward_scale * events.reward,
-            captured=events.captured,
-            collided=events.collided,
-            reached=events.reached,
-            timed_out=events.timed_out,
-            status=result.status,
-            intervention=result.intervention,
-            proposed=jnp.where(finite, limit_speed(action, real(1.0)), action),
-            executed=result.action,
-            pursuer_clearance=events.pursuer_clearance,
-            obstacle_clearance=events.obstacle_clearance,
-            periods=jnp.ones_like(moved.periods),
-            pursuer_invalid=without_answer(wheels).astype(moved.periods.dtype),
-        )
+    def period(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
+        going, *so_far = carry
+        key = lane_by_lane(jax.random.fold_in, start.lanes, keys, episode.periods + going.tally.steps)
+        moved, now = advance(run, going, key)
+        events, result = now.events, now.result
+        flags = (events.captured, events.collided, events.reached, events.timed_out)
+        status, executed, _ = so_far
+        more = [jnp.maximum(status, result.status), executed + result.action, flags]
+        return (moved, *select(now.running, more, so_far)), None
 
-    def another(carry: tuple[Episode, Decision], _: None) -> tuple[tuple[Episode, Decision], None]:
-        (episode, so_far), over = carry, carry[1].ended
-        moved, now = period(episode, over)
-        joined = Decision(
-            reward=so_far.reward + now.reward,
-            captured=now.captured,
-            collided=now.collided,
-            reached=now.reached,
-            timed_out=now.timed_out,
-            status=jnp.maximum(so_far.status, now.status),
-            intervention=so_far.intervention + now.intervention,
-            proposed=so_far.proposed,
-            executed=so_far.executed + now.executed,
-            pursuer_clearance=jnp.minimum(so_far.pursuer_clearance, now.pursuer_clearance),
-            obstacle_clearance=jnp.minimum(so_far.obstacle_clearance, now.obstacle_clearance),
-            periods=so_far.periods + 1,
-            pursuer_invalid=so_far.pursuer_invalid + now.pursuer_invalid,
-        )
-        return select(over, carry, (moved, joined)), None
-
-    episode, made = period(episode, None)
-    if task.decision_steps > 1:
-        (episode, made), _ = jax.lax.scan(another, (episode, made), None, length=task.decision_steps - 1)
-    count = made.periods.astype(made.reward.dtype)
-    return episode, eqx.tree_at(
-        lambda made: (made.intervention, made.executed),
-        made,
-        (made.intervention / count, to_action(scenario, start, made.executed / count)),
+    going = hold(continued(episode.world, episode.memory), nominal)
+    none = jnp.zeros_like(going.running)
+    begun = (going, jnp.full_like(going.outcome, Status.OK), jnp.zeros_like(nominal), (none,) * 4)
+    (end, status, executed, flags), _ = jax.lax.scan(period, begun, None, length=task.decision_steps)
+    tally = end.tally
+    count = tally.steps.astype(tally.total_reward.dtype)
+    moved = EnvState(end.world, end.memory, episode.words, episode.number, episode.periods + tally.steps)
+    return moved, Decision(
+        task.reward_scale * tally.total_reward,
+        *flags,
+        status=status,
+        intervention=tally.correction / count,
+        proposed=jnp.where(finite, limit_speed(action, real(1.0)), action),
+        executed=to_action(scenario, start, executed / count),
+        pursuer_clearance=tally.pursuer_clearance,
+        obstacle_clearance=tally.obstacle_clearance,
+        periods=tally.steps,
+        pursuer_invalid=tally.pursuer_invalid,
     )
 
 
-def seen(task: Task, episode: Episode) -> Float[Array, "*lanes observation"]:
+def seen(task: GymTask, episode: EnvState) -> Float[Array, "*lanes observation"]:
     """The observation in single precision, worlds first, as learners take it."""
     return jnp.moveaxis(observe(task.scenario, episode.world), 0, -1).astype(jnp.float32)

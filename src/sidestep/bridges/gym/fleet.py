@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from sidestep._arrays import AnyArray, select
-from sidestep.bridges.gym.episode import Decision, Episode, begin, begin_in, decide, seen
+from sidestep.bridges.gym.episode import Decision, EnvState, begin, begin_in, decide, seen
 from sidestep.bridges.gym.task import Task
 from sidestep.world import World
 
@@ -28,7 +28,7 @@ AHEAD = 3
 class Fleet(eqx.Module):
     """Lanes of episodes, and which of them have ended."""
 
-    episode: Episode
+    episode: EnvState
     ended: Bool[Array, "lanes"]
 
 
@@ -93,7 +93,7 @@ def follow(fleet: Fleet, spares: Spares, where: Bool[AnyArray, "lanes"]) -> Flee
     for index in range(1, AHEAD):
         spare = select(slot == index, jax.tree.map(lambda leaf: leaf[index], spares), spare)  # noqa: B023
     world, memory = select(where, (spare.world, spare.memory), (now.world, now.memory))
-    episode = Episode(
+    episode = EnvState(
         world,
         memory,
         now.words,

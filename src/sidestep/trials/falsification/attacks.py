@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from sidestep._arrays import real
-from sidestep.learning.td3 import TD3
+from sidestep.learning import TD3
 from sidestep.trials.falsification.attackers import Roster, bang_bang, built_in, herder, script, sideswiper
 from sidestep.trials.falsification.chases import Chase, Target, run_from
 from sidestep.trials.falsification.cross_entropy import Search
@@ -52,10 +52,10 @@ def _round(starts: World, chases: Chase, wheels: Any, searched: int = 0) -> Roun
     return Round(
         jax.tree.map(get, starts),
         get(wheels),
-        get(chases.steps),
+        get(chases.tally.steps),
         get(chases.outcome),
-        get(chases.pursuer_clearance),
-        get(chases.obstacle_clearance),
+        get(chases.tally.pursuer_clearance),
+        get(chases.tally.obstacle_clearance),
         get(chases.margin),
         searched,
     )

@@ -8,10 +8,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from sidestep._arrays import Count, real
-from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.loop import episode
+from sidestep.loop.episode import Episode, Tally, Task, advance, ask
 from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.world import Scenario, World
 
@@ -28,66 +29,56 @@ class Target(eqx.Module):
     policy: Callable[..., Any]
     shield: Any
 
+    def task(self, pursuer: Callable[..., Any]) -> Task:
+        """The same with a pursuer to hunt it."""
+        return Task(self.scenario, self.policy, self.shield, pursuer)
+
 
 class Chase(eqx.Module):
-    """A chase on its way. `outcome` is -1 while it runs; the rest is the least so far, in m.
+    """An episode, and the `margin`: the least h (m, see `escape_margin`) at the end of a period."""
 
-    `margin` is the least h (see `escape_margin`) at the end of a control period.
-    """
-
-    world: World
-    memory: Any
-    nominal: Float[Array, "*batch 2"]
-    steps: Int[Array, "*batch"]
-    outcome: Int[Array, "*batch"]
-    pursuer_clearance: Float[Array, "*batch"]
-    obstacle_clearance: Float[Array, "*batch"]
+    episode: Episode
     margin: Float[Array, "*batch"]
+
+    @property
+    def world(self) -> World:
+        """Where everything is."""
+        return self.episode.world
+
+    @property
+    def outcome(self) -> Int[Array, "*batch"]:
+        """As of the episode: `RUNNING` or an index into `OUTCOMES`."""
+        return self.episode.outcome
+
+    @property
+    def running(self) -> Bool[Array, "*batch"]:
+        """Whether it has not ended."""
+        return self.episode.running
+
+    @property
+    def tally(self) -> Tally:
+        """What the episode has come to so far."""
+        return self.episode.tally
 
 
 def begin(target: Target, world: World) -> Chase:
     """A chase that starts in `world`."""
-    far = real(jnp.inf)
-    return Chase(
-        world=world,
-        memory=target.shield.init(world),
-        nominal=jnp.zeros_like(world.evader),
-        steps=jnp.zeros((), jnp.int32),
-        outcome=jnp.full((), RUNNING, jnp.int32),
-        pursuer_clearance=far,
-        obstacle_clearance=far,
-        margin=far,
-    )
+    return Chase(episode.begin(target.shield, world), real(jnp.inf))
 
 
 def forget(chases: Chase) -> Chase:
     """The same chases with nothing remembered of how close they were."""
     far = jnp.full_like(chases.margin, jnp.inf)
-    return eqx.tree_at(
-        lambda chase: (chase.pursuer_clearance, chase.obstacle_clearance, chase.margin), chases, (far,) * 3
-    )
+    parts = lambda chase: (chase.tally.pursuer_clearance, chase.tally.obstacle_clearance, chase.margin)  # noqa: E731
+    return eqx.tree_at(parts, chases, (far,) * 3)
 
 
-def one_period(
-    target: Target, pursuer: Callable[..., Any], chase: Chase, nominal: Array, key: PRNGKeyArray
-) -> tuple[Chase, Float[Array, "m 2"]]:
+def one_period(task: Task, chase: Chase, key: PRNGKeyArray) -> tuple[Chase, Float[Array, "m 2"]]:
     """A chase one control period later, and the wheel speeds (m/s) asked for; one that ended stays."""
-    scenario, running = target.scenario, chase.outcome == RUNNING
-    world, memory, events, _, wheels = control_step(
-        scenario, target.shield, pursuer, chase.world.set_apart(~running), chase.memory, nominal, key
-    )
-    moved = Chase(
-        world=world,
-        memory=memory,
-        nominal=nominal,
-        steps=chase.steps + 1,
-        outcome=outcome_of(events),
-        pursuer_clearance=jnp.minimum(chase.pursuer_clearance, events.pursuer_clearance),
-        obstacle_clearance=jnp.minimum(chase.obstacle_clearance, events.obstacle_clearance),
-        margin=jnp.minimum(chase.margin, escape_margin(scenario, world)),
-    )
-    pick = lambda new, old: jnp.where(running, new, old)  # noqa: E731
-    return jax.tree.map(pick, moved, chase), jnp.where(running, wheels, 0.0)
+    after, period = advance(task, chase.episode, key)
+    margin = jnp.minimum(chase.margin, escape_margin(task.scenario, period.after))
+    margin = jnp.where(period.running, margin, chase.margin)
+    return Chase(after, margin), jnp.where(period.running, period.wheel_speeds, 0.0)
 
 
 def run(
@@ -106,30 +97,34 @@ def run(
 
     **Returns** the chases, and the wheel speeds (m/s) that were asked for, 0 after a chase's end.
     """
-    scenario, decision_steps = target.scenario, decision_steps_of(target.policy)
-    count = chases.steps.shape[0]
+    count = chases.margin.shape[0]
 
-    def period(part: Any, chase: Chase, nominal: Array, key: PRNGKeyArray) -> tuple[Chase, Array]:
-        return one_period(target, strategy(part), chase, nominal, key)
+    def period(part: Any, chase: Chase, key: PRNGKeyArray) -> tuple[Chase, Array]:
+        return one_period(target.task(strategy(part)), chase, key)
+
+    def decided(now: Array, chases: Chase) -> Chase:
+        task = target.task(strategy)
+        due = now % task.decision_steps == 0
+        nominal = jax.lax.cond(
+            due,
+            lambda: jax.vmap(lambda chase: ask(task, chase.episode).nominal)(chases),
+            lambda: chases.episode.nominal,
+        )
+        return eqx.tree_at(lambda chases: chases.episode.nominal, chases, nominal)
 
     def more(carry: tuple[Array, Chase, Array]) -> Array:
         index, chases, _ = carry
-        return (index < periods) & jnp.any(chases.outcome == RUNNING)
+        return (index < periods) & jnp.any(chases.running)
 
-    def advance(carry: tuple[Array, Chase, Array]) -> tuple[Array, Chase, Array]:
+    def go_on(carry: tuple[Array, Chase, Array]) -> tuple[Array, Chase, Array]:
         index, chases, wheels = carry
         now = begun + index
-        nominal = jax.lax.cond(
-            now % decision_steps == 0,
-            lambda: jax.vmap(lambda world: decide(scenario, target.policy, world))(chases.world),
-            lambda: chases.nominal,
-        )
         step_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, now)
-        chases, asked = jax.vmap(period)(parts, chases, nominal, step_keys)
+        chases, asked = jax.vmap(period)(parts, decided(now, chases), step_keys)
         return index + 1, chases, wheels.at[:, index].set(asked)
 
-    wheels = jnp.zeros((count, periods, scenario.pursuer_count, 2), chases.margin.dtype)
-    _, chases, wheels = jax.lax.while_loop(more, advance, (jnp.zeros((), jnp.int32), chases, wheels))
+    wheels = jnp.zeros((count, periods, target.scenario.pursuer_count, 2), chases.margin.dtype)
+    _, chases, wheels = jax.lax.while_loop(more, go_on, (jnp.zeros((), jnp.int32), chases, wheels))
     return chases, wheels
 
 
@@ -154,8 +149,8 @@ def shortfall(goal: str, chases: Chase) -> Float[Array, "chases"]:
     itself, so that it then is. For a collision the clearance from obstacles counts, and faintly the margin,
     since a pinned evader is one that can be steered.
     """
-    capture = chases.margin + _FAINT * chases.pursuer_clearance
-    collision = chases.obstacle_clearance + _FAINT * jnp.maximum(chases.margin, 0.0)
+    capture = chases.margin + _FAINT * chases.tally.pursuer_clearance
+    collision = chases.tally.obstacle_clearance + _FAINT * jnp.maximum(chases.margin, 0.0)
     if goal == "capture":
         return capture
     if goal == "collision":

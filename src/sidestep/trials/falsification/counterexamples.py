@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 import sidestep
-from sidestep.learning.policy import LearnedPolicy, load_policy
+from sidestep.learning import LearnedPolicy, load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.rollout import Trajectory, rollout
 from sidestep.safety import SHIELDS, Shield, make_shield

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Scalar, norm, real
-from sidestep.learning.td3 import TD3, Batch, Learner, update
-from sidestep.loop.step import RUNNING, decide, decision_steps_of
+from sidestep._arrays import Scalar, norm, real, select
+from sidestep.learning import TD3, Batch, Learner, update
+from sidestep.loop.episode import ask
+from sidestep.loop.step import CAPTURED, COLLIDED
 from sidestep.pursuit import Pursuer
 from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.trials.falsification.chases import Chase, Target, begin, one_period
@@ -129,10 +130,12 @@ def lesson(
         return jnp.stack([look(scenario, world.seen_by(index)) for index in range(m)])
 
     def drive(chase: Chase, wheels: Array, key: PRNGKeyArray) -> tuple[Chase, Float[Array, "t m 2"]]:
+        task = target.task(_Held(wheels))
+
         def period(chase: Chase, key: PRNGKeyArray) -> tuple[Chase, Array]:
-            deciding = chase.steps % decision_steps_of(target.policy) == 0
-            nominal = jnp.where(deciding, decide(scenario, target.policy, chase.world), chase.nominal)
-            return one_period(target, _Held(wheels), chase, nominal, key)
+            deciding = chase.tally.steps % task.decision_steps == 0
+            asked = select(deciding, ask(task, chase.episode), chase.episode)
+            return one_period(task, Chase(asked, chase.margin), key)
 
         return jax.lax.scan(period, chase, jax.random.split(key, steps))
 
@@ -149,9 +152,9 @@ def lesson(
         promise = jax.vmap(lambda world: _promise(scenario, world, goal))
         lost = _lost(moved, goal)
         reward = _PER_METRE * (promise(chases.world) - promise(moved.world)) + jnp.where(lost, _BONUS, 0.0)
-        over = (moved.outcome != RUNNING).astype(reward.dtype)
+        over = (~moved.running).astype(reward.dtype)
         rows = Batch(seen[:, 0], acted[:, 0], reward, jax.vmap(sees)(moved.world)[:, 0], over)
-        ring = _remember(pupil.ring, rows, chases.outcome == RUNNING)
+        ring = _remember(pupil.ring, rows, chases.running)
         learner = _study(lessons, pupil.learner, ring, learn_key)
         return (Pupil(learner, ring), moved), wheels
 
@@ -164,7 +167,7 @@ def lesson(
 
 
 def _lost(chases: Chase, goal: str) -> Bool[Array, "chases"]:
-    captured, collided = chases.outcome == 0, chases.outcome == 1
+    captured, collided = chases.outcome == CAPTURED, chases.outcome == COLLIDED
     return captured if goal == "capture" else collided if goal == "collision" else captured | collided
 
 

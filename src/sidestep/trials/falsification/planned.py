@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arrays import Count, select
-from sidestep.loop.step import RUNNING
 from sidestep.trials.falsification.attackers import script
 from sidestep.trials.falsification.chases import Chase, Target, begin, forget, run, shortfall
 from sidestep.trials.falsification.cross_entropy import Optimum, Search, minimise
@@ -158,6 +157,6 @@ def chase_with_plans(
         plan_key = jax.random.fold_in(key, number)
         chases, wheels, knots, _ = plan_and_drive(target, planning, chases, knots, begun, goal, plan_key)
         driven.append(np.asarray(wheels))
-        if not np.any(np.asarray(chases.outcome) == RUNNING):
+        if not np.any(np.asarray(chases.running)):
             break
     return chases, np.concatenate(driven, axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 import sidestep
 from sidestep import _interrupts
 from sidestep._arrays import seed_number, whole_number
-from sidestep.learning.policy import load_policy
+from sidestep.learning import load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.safety import Shield, as_shield
 from sidestep.store.files import OutputError, json_safe, make_folder

@@ -1,0 +1,179 @@
+"""One episode: control period after control period, summed up in one tally, until it ends.
+
+Every loop of the package goes through `advance`: training, batch evaluation, recorded episodes, the
+falsifier's chases and the environments of `bridges.gym`. They differ in who chooses the nominal action, in
+the random keys and in what they read of each period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sidestep._arrays import AnyArray, Lanes, select
+from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
+from sidestep.pursuit import without_answer
+from sidestep.safety import ShieldResult, Status, start_in_lanes
+from sidestep.world import Events, Scenario, World
+
+
+class Task(eqx.Module):
+    """What is run: a `policy` behind its `shield`, hunted by a `pursuer`, in a `scenario`.
+
+    `policy(observation) -> action in [-1, 1]^2` is asked every `decision_steps` control periods; None where
+    the caller chooses the nominal action. `pursuer(scenario, world, key) -> wheel speeds (2,)` in m/s.
+    """
+
+    scenario: Scenario
+    policy: Callable[..., Any] | None
+    shield: Any
+    pursuer: Callable[..., Any]
+
+    @property
+    def decision_steps(self) -> int:
+        """Control periods between two decisions of the policy. **Raises** as `decision_steps_of`."""
+        return decision_steps_of(self.policy)
+
+
+class Tally(eqx.Module):
+    """What an episode has come to so far.
+
+    **Attributes:** `total_reward`; `steps` control periods; the least clearances of all periods (m); how many
+    periods the shield corrected (`interventions`), could not satisfy its rows in (`infeasible`), was given
+    numbers that are not finite in (`invalid`); in how many a pursuer's wheel speeds were not finite
+    (`pursuer_invalid`); the sum and the maximum of |action - nominal| (m/s).
+    """
+
+    total_reward: Lanes
+    steps: Int[Array, "*lanes"]
+    pursuer_clearance: Lanes
+    obstacle_clearance: Lanes
+    interventions: Int[Array, "*lanes"]
+    infeasible: Int[Array, "*lanes"]
+    invalid: Int[Array, "*lanes"]
+    pursuer_invalid: Int[Array, "*lanes"]
+    correction: Lanes
+    max_correction: Lanes
+
+    @classmethod
+    def zero(cls, world: World) -> Tally:
+        """Before the first period, for one world or for each of many in lanes."""
+        zero = jnp.zeros_like(world.time)
+        count, far = jnp.zeros_like(world.time, jnp.int32), jnp.full_like(zero, jnp.inf)
+        return cls(zero, count, far, far, count, count, count, count, zero, zero)
+
+    def add(self, events: Events, result: ShieldResult, wheel_speeds: Float[Array, "m 2 *lanes"]) -> Tally:
+        """One period more."""
+        count = lambda flags: flags.astype(jnp.int32)  # noqa: E731
+        return Tally(
+            total_reward=self.total_reward + events.reward,
+            steps=self.steps + 1,
+            pursuer_clearance=jnp.minimum(self.pursuer_clearance, events.pursuer_clearance),
+            obstacle_clearance=jnp.minimum(self.obstacle_clearance, events.obstacle_clearance),
+            interventions=self.interventions + count(result.status != Status.OK),
+            infeasible=self.infeasible + count(result.status == Status.INFEASIBLE),
+            invalid=self.invalid + count(result.status == Status.INVALID),
+            pursuer_invalid=self.pursuer_invalid + count(without_answer(wheel_speeds)),
+            correction=self.correction + result.intervention,
+            max_correction=jnp.maximum(self.max_correction, result.intervention),
+        )
+
+
+class Episode(eqx.Module):
+    """An episode that is running, or has ended: then nothing changes any more.
+
+    **Attributes:** `world`; the shield's `memory`; the `nominal` velocity (m/s, world axes) that is held
+    until the next decision; `outcome` `RUNNING` or an index into `store.runs.OUTCOMES`; the `tally`.
+    """
+
+    world: World
+    memory: Any
+    nominal: Float[Array, "2 *lanes"]
+    outcome: Int[Array, "*lanes"]
+    tally: Tally
+
+    @property
+    def running(self) -> Bool[Array, "*lanes"]:
+        """Whether it has not ended."""
+        return self.outcome == RUNNING
+
+
+class Period(NamedTuple):
+    """What one control period brought, for callers to read.
+
+    `world` and `after` at its beginning and end; `nominal` velocity (m/s); the `ShieldResult`; the
+    `wheel_speeds (m, 2)` in m/s that the pursuers asked for; the `Events`. Where the episode was not
+    `running` before it, none of this happened.
+    """
+
+    world: World
+    after: World
+    nominal: Float[Array, "2 *lanes"]
+    result: ShieldResult
+    wheel_speeds: Float[Array, "m 2 *lanes"]
+    events: Events
+    running: Bool[Array, "*lanes"]
+
+
+def begin(shield: Any, world: World) -> Episode:
+    """The episode that starts in `world`, or in each of many worlds in lanes."""
+    return continued(world, start_in_lanes(shield, world))
+
+
+def continued(world: World, memory: Any) -> Episode:
+    """An episode from `world` on, with the shield's `memory` and an empty tally."""
+    return Episode(
+        world=world,
+        memory=memory,
+        nominal=jnp.zeros_like(world.evader),
+        outcome=jnp.full_like(world.time, RUNNING, jnp.int32),
+        tally=Tally.zero(world),
+    )
+
+
+def hold(episode: Episode, nominal: Float[AnyArray, "2 *lanes"]) -> Episode:
+    """The same episode with another nominal velocity (m/s, world axes) to hold."""
+    return eqx.tree_at(lambda episode: episode.nominal, episode, nominal)
+
+
+def ask(task: Task, episode: Episode) -> Episode:
+    """The same episode with the nominal velocity that the policy now decides on."""
+    assert task.policy is not None
+    return hold(episode, decide(task.scenario, task.policy, episode.world))
+
+
+def ask_in_time(task: Task, episode: Episode, count: Int[Array, ""]) -> Episode:
+    """`ask` if a decision is due after `count` control periods, of this episode or of all in lanes."""
+    due = count % task.decision_steps == 0
+    return hold(episode, jax.lax.cond(due, lambda: ask(task, episode).nominal, lambda: episode.nominal))
+
+
+def advance(task: Task, episode: Episode, key: Any) -> tuple[Episode, Period]:
+    """One control period with the nominal velocity that the episode holds.
+
+    One episode, or many in lanes (see `control_step`); then `key` has one entry for each as well.
+    """
+    running = episode.running
+    world, memory, events, result, wheel_speeds = control_step(
+        task.scenario,
+        task.shield,
+        task.pursuer,
+        episode.world.set_apart(~running),
+        episode.memory,
+        episode.nominal,
+        key,
+    )
+    moved = Episode(
+        world=world,
+        memory=memory,
+        nominal=episode.nominal,
+        outcome=outcome_of(events),
+        tally=episode.tally.add(events, result, wheel_speeds),
+    )
+    period = Period(episode.world, world, episode.nominal, result, wheel_speeds, events, running)
+    return select(running, moved, episode), period
