@@ -47,7 +47,7 @@ def test_seed_decides_everything(small, small_run):
     assert again.metrics == small_run.metrics
     assert small.differences(again.state, small_run.state) == []
     changed = small.differences(other.state, small_run.state)
-    for part in (".learner.actor", ".replay.transitions.world.evader", ".world.target", ".key"):
+    for part in (".learner.actor", ".replay.transitions.world.evader", ".episode.world.target", ".key"):
         assert any(name.startswith(part) for name in changed), part
 
 
@@ -123,7 +123,7 @@ def test_seeds_and_learning_rates_under_vmap_train_as_they_do_alone(small, x64):
         np.testing.assert_allclose(actual[name], leaf, rtol=1e-8, atol=1e-8, err_msg=name)
         # What double precision trains in is double precision throughout.
         assert leaf.dtype != np.float32, name
-        assert np.all(np.isfinite(leaf)) or name.startswith("[0].tally"), name
+        assert np.all(np.isfinite(leaf)) or name.startswith("[0].episode.tally"), name
 
 
 # Which action is learned from ------------------------------------------------------------------------------
