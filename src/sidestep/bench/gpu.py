@@ -79,8 +79,7 @@ def _training(settings: dict[str, Any]) -> tuple[Any, int, str]:
     import jax
     import jax.numpy as jnp
 
-    from sidestep.learning.options import make_options
-    from sidestep.learning.training import decide_and_learn, start
+    from sidestep.learning import decide_and_learn, make_options, start
     from sidestep.pursuit import make_pursuer
     from sidestep.safety import make_shield
     from sidestep.world import load_scenario

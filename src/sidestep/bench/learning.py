@@ -73,18 +73,17 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     return {"steps_per_second": best, "ratios": ratios}
 
 
-def training(shield: str, scenario: Any = None) -> tuple[Callable[..., Any], Any, Any]:
-    """`(advance(state, length) -> state, start(seed) -> state, options)` of our training loop."""
+def training(shield: str) -> tuple[Callable[[Any, int], Any], Callable[[int], Any]]:
+    """`advance(state, length) -> state` and `begin(seed) -> state` of our training loop."""
     import jax
     import jax.numpy as jnp
 
-    from sidestep.learning.options import make_options
-    from sidestep.learning.training import run_chunk, start
+    from sidestep.learning import make_options, run_chunk, start
     from sidestep.pursuit import make_pursuer
     from sidestep.safety import make_shield
     from sidestep.world import load_scenario
 
-    scenario = scenario or load_scenario("paper")
+    scenario = load_scenario("paper")
     options = make_options(
         decision_steps=1, updates_per_decision=1, batch_size=BATCH, hidden=HIDDEN, warmup_decisions=WARMUP
     )
@@ -98,11 +97,11 @@ def training(shield: str, scenario: Any = None) -> tuple[Callable[..., Any], Any
         state, _ = jax.block_until_ready(run_chunk(scenario, guard, pursuer, options, state, forever, length))
         return state
 
-    return advance, begin, options
+    return advance, begin
 
 
 def _ours(shield: str, chunk: int) -> Callable[[], None]:
-    step, begin, _ = training(shield)
+    step, begin = training(shield)
     state = begin(0)
 
     def advance() -> None:

@@ -149,11 +149,11 @@ def _jax_product(product: Product, budget: float) -> float:
 
 
 def _update(budget: float) -> dict[str, Any]:
-    """`sidestep.learning.td3.update` alone, on one batch, a compiled loop of them."""
+    """`sidestep.learning.update` alone, on one batch, a compiled loop of them."""
     import jax
     import jax.numpy as jnp
 
-    from sidestep.learning.td3 import TD3, Batch, update
+    from sidestep.learning import TD3, Batch, update
     from sidestep.world import load_scenario, observation_size
 
     size, random = observation_size(load_scenario("paper")), np.random.default_rng(0)
@@ -187,7 +187,7 @@ def _update(budget: float) -> dict[str, Any]:
 
 def _training_loop(budget: float) -> dict[str, Any]:
     """Steps per second of the loop behind the shield `game`; each is one update."""
-    step, begin, _ = training("game")
+    step, begin = training("game")
     state, chunk = begin(0), 50
     for _ in range(8):
         state = step(state, chunk)

@@ -169,7 +169,7 @@ def _seeds(settings: dict[str, Any]) -> Points:
     from sidestep.bench.learning import WARMUP, training
 
     steps = 10
-    advance, begin, _ = training("game")
+    advance, begin = training("game")
     together = eqx.filter_jit(eqx.filter_vmap(lambda state: advance(state, steps)))
 
     def one_by_one(states: Any) -> None:

@@ -6,6 +6,7 @@ from sidestep.learning.options import TrainingOptions, make_options, options_to_
 from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
 from sidestep.learning.run import Progress, Training, resume_settings, train
 from sidestep.learning.td3 import TD3, Batch, Learner, update
+from sidestep.learning.training import decide_and_learn, run_chunk, start
 
 __all__ = [
     "TD3",
@@ -17,10 +18,13 @@ __all__ = [
     "Progress",
     "Training",
     "TrainingOptions",
+    "decide_and_learn",
     "load_policy",
     "make_options",
     "options_to_dict",
     "resume_settings",
+    "run_chunk",
+    "start",
     "train",
     "update",
     "write_policy",
