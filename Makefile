@@ -126,7 +126,7 @@ docs: $(READY_DEV) ## Build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
 bench: $(BENCH_READY) ## Measure ours and the peers, 15 minutes (one section: make bench ARGS=filter)
-	$(BENCH_VENV)/bin/sidestep bench --json benchmarks/results/bench.json --figures runs/bench $(ARGS)
+	$(BENCH_PY) benchmarks/bench.py --json benchmarks/results/bench.json --figures runs/bench $(ARGS)
 
 # An environment of its own keeps PyTorch and the peers out of the main one. PyTorch goes first, in one exact
 # version, so that nothing later pulls in another build of it.

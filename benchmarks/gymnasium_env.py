@@ -2,7 +2,7 @@
 
     python benchmarks/gymnasium_env.py --json benchmarks/results/gymnasium_env.json
 
-The plain environment (`sidestep.bench.gymnasium_task`) is what a user of Gymnasium would write with NumPy
+The plain environment (`speed/gymnasium_task.py`) is what a user of Gymnasium would write with NumPy
 and math: one world, the pursuer `turn-then-drive`, no shield. Ours steps `--worlds` of them through
 `make_vec`, with observations, rewards, flags, infos and automatic resets, as a learner gets them; behind
 shields too, which the plain one does not have. All are told to head straight for the target. They take turns
@@ -22,8 +22,8 @@ import jax
 import numpy as np
 
 import sidestep.bridges.gym
-from sidestep.bench.gymnasium_task import make_environment
-from sidestep.bench.machine import load, machine, versions
+from machine import load, machine, versions
+from speed.gymnasium_task import make_environment
 
 PURSUER = "turn-then-drive"
 

@@ -28,7 +28,7 @@ import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from sidestep.bench.machine import load, machine, versions
+from machine import load, machine, versions
 
 SCREENS = {"laptop": (1280, 760, 1), "projector": (1920, 1080, 1), "phone": (390, 844, 2)}
 """Width and height in CSS pixels, and how many real ones each is wide."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import sidestep
-from sidestep.bench.machine import load, machine, versions
+from machine import load, machine, versions
 from sidestep.commands.fly import flight_counts
 from sidestep.learning import load_policy
 from sidestep.learning import train as run_training

@@ -24,7 +24,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sidestep_ros.recorder import Recorder, values_of
 
-from sidestep.bench.machine import load, machine, versions
+from machine import load, machine, versions
 
 _PATIENCE = 300.0
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from sidestep import _packages
-from sidestep.bench.peers import MissingPeer, peer
 
 PIP = ["-m", "pip", "install"]
 
@@ -91,8 +90,3 @@ def test_the_error_names_package_and_command_and_has_the_callers_class(monkeypat
     monkeypatch.setitem(sys.modules, "mcap", None)
     with pytest.raises(ZeroDivisionError, match=r"logs need the package 'mcap'.*pip install .*\[logs\]"):
         _packages.needed("mcap", "logs", "logs need", ZeroDivisionError)
-
-
-def test_a_missing_peer_is_sent_to_pytorch_first():
-    with pytest.raises(MissingPeer, match=r"pip install torch==2\.13\.0 && .*pip install .*\[bench\]"):
-        peer("no_such_peer_of_ours")

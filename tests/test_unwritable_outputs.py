@@ -42,8 +42,6 @@ BELOW, FOLDER = "{file}/below", "{folder}"
         ["twin", "--video", BELOW + ".gif"],
         ["fly", "--json", FOLDER],
         ["fly", "--out", BELOW],
-        ["bench", "filter", "--json", BELOW],
-        ["bench", "filter", "--figures", BELOW],
     ],
     ids=" ".join,
 )

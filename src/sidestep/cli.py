@@ -11,7 +11,6 @@ from tyro.conf import subcommand
 
 from sidestep._compiled import keep_compiled_programs
 from sidestep.commands import (
-    bench,
     campaign,
     certify,
     evaluate,
@@ -38,7 +37,6 @@ _RUN: dict[type, Callable[..., int]] = {
     export.Export: export.run,
     twin.Twin: twin.run,
     fly.Fly: fly.run,
-    bench.Bench: bench.run,
 }
 
 
@@ -55,8 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[campaign.Campaign, subcommand("campaign")]
         | Annotated[export.Export, subcommand("export")]
         | Annotated[twin.Twin, subcommand("twin")]
-        | Annotated[fly.Fly, subcommand("fly")]
-        | Annotated[bench.Bench, subcommand("bench")],
+        | Annotated[fly.Fly, subcommand("fly")],
         prog="sidestep",
         description="Safe reinforcement learning for a robot that is being pursued.",
         args=arguments,

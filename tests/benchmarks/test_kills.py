@@ -1,7 +1,8 @@
 """Hazard: a kill at some moment that loses or changes something, or a study that would not see it."""
 
-import kills
 import pytest
+
+import kills
 
 
 def test_killed_training_ends_as_if_nothing_had_been(capsys):

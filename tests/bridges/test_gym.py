@@ -17,7 +17,6 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from sidestep.bench.peer_task import PeerTask
 from sidestep.bridges.gym import (
     ID,
     PursuedEnv,
@@ -41,6 +40,7 @@ from sidestep.world import (
     to_action,
     to_velocity,
 )
+from speed.peer_task import PeerTask
 
 HOLD, LIMIT = 3, 120
 # One scenario for all: tasks of one structure share their compiled programs.

@@ -1,6 +1,8 @@
 """Every case runs in a child process of its own, one after the other: no side warms up or slows down another.
 
-    python -m sidestep.bench.children '{"section": "filter", "settings": {...}}'
+In the folder `benchmarks`
+
+    python -m speed.children '{"section": "filter", "settings": {...}}'
 
 prints progress to the error stream and one line of JSON, the case's figures, to standard output.
 """
@@ -13,10 +15,14 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from sidestep.bench import machine
+from machine import load
+from sidestep._compiled import cores
+from speed import process
 
+_BENCHMARKS = Path(__file__).parents[1]
 MOST_SECONDS = 300
 """A case that takes longer is ended and says so."""
 
@@ -31,7 +37,7 @@ class Case:
     section: str
     name: str
     settings: dict[str, Any]
-    threads: int = field(default_factory=machine.cores)
+    threads: int = field(default_factory=cores)
     environment: dict[str, str] = field(default_factory=dict)
 
 
@@ -41,18 +47,19 @@ def run_case(case: Case) -> dict[str, Any]:
         "name": case.name,
         "threads": case.threads,
         "settings": case.settings,
-        "load_before": machine.load(),
+        "load_before": load(),
     }
-    environment = machine.thread_environment(case.threads, **case.environment)
+    environment = process.thread_environment(case.threads, **case.environment)
     about["environment"] = {
-        name: environment[name] for name in machine.THREAD_SETTINGS if name in environment
+        name: environment[name] for name in process.THREAD_SETTINGS if name in environment
     }
     task = json.dumps({"section": case.section, "settings": case.settings})
     begun = time.monotonic()
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "sidestep.bench.children", task],
+            [sys.executable, "-m", "speed.children", task],
             env=environment,
+            cwd=_BENCHMARKS,
             capture_output=True,
             text=True,
             timeout=MOST_SECONDS,
@@ -69,8 +76,8 @@ def run_case(case: Case) -> dict[str, Any]:
 
 
 def _child(task: str) -> dict[str, Any]:
-    from sidestep.bench.peers import MissingPeer
-    from sidestep.bench.sections import section
+    from speed.peers import MissingPeer
+    from speed.sections import section
 
     what = json.loads(task)
     try:
@@ -80,7 +87,7 @@ def _child(task: str) -> dict[str, Any]:
     # Not before: it imports JAX, and `startup` measures children of a small process.
     from sidestep.store.files import json_safe
 
-    return json_safe({"peak_memory_mib": machine.peak_memory_mib(), **figures})
+    return json_safe({"peak_memory_mib": process.peak_memory_mib(), **figures})
 
 
 def main() -> None:

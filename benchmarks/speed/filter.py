@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from sidestep._compiled import cores
-from sidestep.bench.children import Case
-from sidestep.bench.machine import synchronous_dispatch
-from sidestep.bench.timing import durations, first_call, spread
+from speed.children import Case
+from speed.process import synchronous_dispatch
+from speed.timing import durations, first_call, spread
 
 LIMIT = 0.18
 """Speed limit, m/s."""
@@ -161,7 +161,7 @@ def exact_answers(given: Problems) -> tuple[np.ndarray, np.ndarray]:
 
 def make_side(name: str, given: Problems) -> Side:
     """One side with these problems prepared for it. **Raises** `MissingPeer` if it is not installed."""
-    from sidestep.bench import filter_peers
+    from speed import filter_peers
 
     if name == "ours":
         return _ours(given)
@@ -175,7 +175,7 @@ def _ours(given: Problems) -> Side:
     import jax
     import jax.numpy as jnp
 
-    from sidestep.safety.filter.projection import project
+    from sidestep.safety import project
 
     solve = jax.jit(project)
     limit = jnp.asarray(LIMIT, jnp.float32)

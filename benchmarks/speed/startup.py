@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sidestep.bench.children import Case
-from sidestep.bench.machine import peak_memory_of_children_mib
-from sidestep.bench.timing import spread
+from speed.children import Case
+from speed.process import peak_memory_of_children_mib
+from speed.timing import spread
 
 CLI = ["-m", "sidestep"]
 COMMANDS: dict[str, list[str]] = {

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.bench.filter import LIMIT, SINGLES, Problems, Side
-from sidestep.bench.peers import peer
+from speed.filter import LIMIT, SINGLES, Problems, Side
+from speed.peers import peer
 
 
 def _jax_side(solve: Any, given: Problems) -> Side:

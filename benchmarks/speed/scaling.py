@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-from sidestep.bench import machine
-from sidestep.bench.children import Case
-from sidestep.bench.timing import durations, first_call, tail_exponent
+from speed import process
+from speed.children import Case
+from speed.timing import durations, first_call, tail_exponent
 
 WORLDS = 256
 """Worlds side by side where something else grows."""
@@ -63,7 +63,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     points: list[dict[str, Any]] = []
     end = time.perf_counter() + settings["most_seconds"]
     for size, (spent, compiling, what) in zip(sizes, _CURVES[curve](settings), strict=False):
-        memory = machine.peak_memory_mib()
+        memory = process.peak_memory_mib()
         at_start = memory if at_start is None else at_start
         points.append(
             {
@@ -71,7 +71,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
                 "peak_memory_mib": memory, "above_first_mib": memory - at_start,
             }
         )  # fmt: skip
-        machine.forget_peak_memory()
+        process.forget_peak_memory()
         # The next size, compiled and repeated, would take longer than is left.
         if time.perf_counter() > end or (curve == "episodes" and time.perf_counter() + 9.0 * spent > end):
             break
@@ -94,21 +94,21 @@ def _measure(call: Callable[[int], Any], budget: float) -> tuple[float, float]:
 
 
 def _worlds(settings: dict[str, Any]) -> Points:
-    from sidestep.bench.worlds import crowded
+    from speed.worlds import crowded
 
     for size in settings["sizes"]:
         yield _stepped(*crowded(size, 1, 1), settings)
 
 
 def _obstacles(settings: dict[str, Any]) -> Points:
-    from sidestep.bench.worlds import crowded
+    from speed.worlds import crowded
 
     for size in settings["sizes"]:
         yield _stepped(*crowded(WORLDS, size, 1), settings)
 
 
 def _pursuers(settings: dict[str, Any]) -> Points:
-    from sidestep.bench.worlds import crowded
+    from speed.worlds import crowded
 
     for size in settings["sizes"]:
         yield _stepped(*crowded(WORLDS, 1, size), settings)
@@ -116,7 +116,7 @@ def _pursuers(settings: dict[str, Any]) -> Points:
 
 def _stepped(scenario: Any, starts: Any, settings: dict[str, Any]) -> tuple[float, float, str]:
     from sidestep._threads import useful_threads
-    from sidestep.bench.worlds import stepper
+    from speed.worlds import stepper
 
     periods = 10
     threads = useful_threads(starts.evader.shape[0])
@@ -126,7 +126,7 @@ def _stepped(scenario: Any, starts: Any, settings: dict[str, Any]) -> tuple[floa
 
 
 def _rows(settings: dict[str, Any]) -> Points:
-    from sidestep.bench.filter import make_side, problems
+    from speed.filter import make_side, problems
 
     for rows in settings["sizes"]:
         side = make_side(settings["side"], problems(PROBLEMS, rows))
@@ -166,7 +166,7 @@ def _seeds(settings: dict[str, Any]) -> Points:
     import jax
     import jax.numpy as jnp
 
-    from sidestep.bench.learning import WARMUP, training
+    from speed.learning import WARMUP, training
 
     steps = 10
     advance, begin = training("game")

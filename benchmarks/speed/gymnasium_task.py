@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.bench.peer_task import PeerTask
-from sidestep.bench.peers import peer
+from speed.peer_task import PeerTask
+from speed.peers import peer
 
 REWARD_SCALE = 0.01
 """What the learner sees of the reward, as in ours."""

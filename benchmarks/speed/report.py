@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import machine
 from sidestep._compiled import cores
-from sidestep.bench import machine
-from sidestep.bench.children import run_case
-from sidestep.bench.sections import SECTIONS, section
-from sidestep.bench.timing import tail_exponent
+from speed.children import run_case
+from speed.sections import SECTIONS, section
+from speed.timing import tail_exponent
 
 
 def run_section(name: str, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
@@ -19,7 +19,7 @@ def run_section(name: str, quick: bool, say: Callable[[str], None]) -> dict[str,
     module, begun = section(name), time.time()
     load = machine.load()
     if load is not None and load > 0.5 * cores():
-        say(f"[yellow]something else runs here (load {load:.1f}): figures suffer[/yellow]")
+        say(f"something else runs here (load {load:.1f}): figures suffer")
     measured = []
     for case in module.cases(quick):
         figures = run_case(case)
@@ -78,7 +78,7 @@ def load_results(path: Path | None) -> dict[str, Any]:
 
     results = read_json(path)
     if not isinstance(results, dict) or not isinstance(results.get("sections"), dict):
-        raise ValueError(f"{path}: not a file that sidestep bench has written; it is left as it is")
+        raise ValueError(f"{path}: not a file that benchmarks/bench.py has written; it is left as it is")
     return results
 
 
@@ -164,8 +164,8 @@ def draw(results: dict[str, Any], folder: Path) -> list[Path]:
     """Figures and `bench.md` in `folder`; their paths. **Raises** `ValueError` if there are no results."""
     if not results["sections"]:
         raise ValueError(f"nothing has been measured, so there is nothing to draw into {folder}")
-    from sidestep.bench.figures import draw_all
     from sidestep.store.files import write_bytes
+    from speed.figures import draw_all
 
     paths = draw_all(results, folder)
     write_bytes(folder / "bench.md", markdown(results).encode())

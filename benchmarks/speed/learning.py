@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from sidestep._compiled import cores
-from sidestep.bench.children import Case
-from sidestep.bench.timing import durations, first_call, spread
+from speed.children import Case
+from speed.timing import durations, first_call, spread
 
 BATCH, HIDDEN, WARMUP, BUFFER = 256, [256, 256], 256, 10_000
 PURSUER = "turn-then-drive"
@@ -115,8 +115,8 @@ def _rejax(chunk: int) -> Callable[[], None]:
     """rejax's `train`, compiled whole as its authors do, `chunk` steps a call, and no evaluation in it."""
     import jax
 
-    from sidestep.bench.peers import peer
-    from sidestep.bench.rejax_task import PursuedInJax
+    from speed.peers import peer
+    from speed.rejax_task import PursuedInJax
 
     rejax, networks, linen = peer("rejax"), peer("rejax.networks"), peer("flax.linen")
     task = PursuedInJax(PURSUER)
@@ -158,8 +158,8 @@ def _rejax(chunk: int) -> Callable[[], None]:
 
 def _stable_baselines(side: str, chunk: int, budget: float) -> tuple[float, list[float]]:
     """Seconds of the first chunk after the random steps, and of those after it, told by a callback."""
-    from sidestep.bench.gymnasium_task import make_environment
-    from sidestep.bench.peers import peer
+    from speed.gymnasium_task import make_environment
+    from speed.peers import peer
 
     callbacks, noises = peer("stable_baselines3.common.callbacks"), peer("stable_baselines3.common.noise")
     threads = int(os.environ.get("OMP_NUM_THREADS", cores()))

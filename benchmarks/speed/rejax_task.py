@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sidestep.bench.gymnasium_task import REWARD_SCALE
-from sidestep.bench.peers import peer
+from speed.gymnasium_task import REWARD_SCALE
+from speed.peers import peer
 
 
 class PursuedInJax:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sidestep.bench.children import Case
-from sidestep.bench.timing import durations, first_call, spread
+from speed.children import Case
+from speed.timing import durations, first_call, spread
 
 CASES: dict[str, dict[str, Any]] = {
     "worlds, game shield": {"kind": "worlds", "shield": "game", "size": 1_048_576, "periods": 20},
@@ -57,8 +57,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _worlds(settings: dict[str, Any]) -> tuple[Any, int, str]:
-    from sidestep.bench.worlds import drawn, stepper
     from sidestep.world import load_scenario
+    from speed.worlds import drawn, stepper
 
     scenario, size, periods = load_scenario("paper"), settings["size"], settings["periods"]
     starts = drawn(scenario, size)
@@ -67,7 +67,7 @@ def _worlds(settings: dict[str, Any]) -> tuple[Any, int, str]:
 
 
 def _filter(settings: dict[str, Any]) -> tuple[Any, int, str]:
-    from sidestep.bench.filter import make_side, problems
+    from speed.filter import make_side, problems
 
     side = make_side("ours", problems(settings["size"], settings["rows"]))
     return lambda _: side.batch(), settings["size"], "problems/s"

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from sidestep._compiled import cores
-from sidestep.bench.children import Case
-from sidestep.bench.learning import BATCH, HIDDEN, training
-from sidestep.bench.timing import durations, spread
+from speed.children import Case
+from speed.learning import BATCH, HIDDEN, training
+from speed.timing import durations, spread
 
 Product = tuple[str, int, int, int]
 """Kind (NN, NT or TN) and rows, inner length and columns of a product."""

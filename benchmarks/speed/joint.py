@@ -10,9 +10,9 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sidestep.bench.children import Case
-from sidestep.bench.machine import synchronous_dispatch
-from sidestep.bench.timing import first_call, spread
+from speed.children import Case
+from speed.process import synchronous_dispatch
+from speed.timing import first_call, spread
 
 PURSUER = "nash"
 MOST_EPISODES = 1000
@@ -34,10 +34,10 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from sidestep.bench.worlds import AHEAD
     from sidestep.pursuit import make_pursuer, pursue
     from sidestep.safety import make_shield
     from sidestep.world import load_scenario, to_velocity
+    from speed.worlds import AHEAD
 
     synchronous_dispatch()
     scenario = load_scenario("paper")

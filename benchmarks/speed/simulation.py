@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.bench.children import Case
-from sidestep.bench.timing import durations, first_call, spread
+from speed.children import Case
+from speed.timing import durations, first_call, spread
 
 PURSUER = "turn-then-drive"
 SIDES = {"ours, game shield": "game", "ours, no shield": "none", "Gymnasium loop": None}
@@ -33,8 +33,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if settings["shield"] is None:
         return _loop(settings["seconds"])
     from sidestep._threads import useful_threads
-    from sidestep.bench.worlds import drawn, stepper
     from sidestep.world import load_scenario
+    from speed.worlds import drawn, stepper
 
     worlds, periods = settings["worlds"], settings["periods"]
     scenario = load_scenario("paper")
@@ -51,7 +51,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _loop(budget: float) -> dict[str, Any]:
-    from sidestep.bench.gymnasium_task import make_environment
+    from speed.gymnasium_task import make_environment
 
     environment = make_environment()
     action = np.array([1.0, 0.0], np.float32)

@@ -1,4 +1,4 @@
-"""Figures of what `sidestep bench` measured, from its JSON alone."""
+"""Figures of what `benchmarks/bench.py` measured, from its JSON alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from sidestep.bench.timing import tail, tail_exponent
 from sidestep.views.style import (
     BLUE,
     FAINT,
@@ -27,6 +26,7 @@ from sidestep.views.style import (
     panel_titles,
     save,
 )
+from speed.timing import tail, tail_exponent
 
 CURVE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
 MARKERS = ("o", "s", "^", "D")

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.bench.peer_task import PeerTask
 from sidestep.pursuit import make_pursuer
 from sidestep.world import World, load_scenario, observe, scenario_to_dict, to_velocity
+from speed.peer_task import PeerTask
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""The sections of `sidestep bench`, by name."""
+"""The sections of `benchmarks/bench.py`, by name."""
 
 from __future__ import annotations
 
@@ -25,4 +25,4 @@ def section(name: str) -> Any:
     """
     if name not in SECTIONS:
         raise ValueError(f"no section '{name}'; there are {', '.join(SECTIONS)}")
-    return importlib.import_module(f"sidestep.bench.{name}")
+    return importlib.import_module(f"speed.{name}")

@@ -3,20 +3,23 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.bench import children, filter_peers, learning, machine, report, roofline, scaling, timing
-from sidestep.bench import filter as filter_section
-from sidestep.bench.children import Case, run_case
-from sidestep.bench.figures import draw_all
-from sidestep.bench.peers import MissingPeer, peer
-from sidestep.bench.sections import SECTIONS, section
-from sidestep.cli import main
+import bench
 from sidestep.safety.filter.projection import project
+from speed import children, filter_peers, learning, process, report, roofline, scaling, timing
+from speed import filter as filter_section
+from speed.children import Case, run_case
+from speed.figures import draw_all
+from speed.peers import MissingPeer, peer
+from speed.sections import SECTIONS, section
+
+BENCHMARKS = Path(bench.__file__).parent
 
 
 @pytest.mark.parametrize("rows", [2, 8])
@@ -99,8 +102,8 @@ def test_spread_names_the_worst():
     assert figures["count"] == 100
 
 
-def test_a_missing_peer_says_what_to_install():
-    with pytest.raises(MissingPeer, match=r"pip install .*\[bench\]"):
+def test_a_missing_peer_says_what_to_install_and_pytorch_first():
+    with pytest.raises(MissingPeer, match=r"pip install torch==2\.13\.0 && .*pip install .*\[bench\]"):
         peer("no_such_peer_of_ours")
 
 
@@ -118,7 +121,7 @@ def test_a_case_runs_in_a_process_of_its_own_and_survives_what_its_library_print
 def test_a_shell_that_slows_jax_down_slows_no_side_down(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
-    environment = machine.thread_environment(2, JAX_PLATFORMS="cpu")
+    environment = process.thread_environment(2, JAX_PLATFORMS="cpu")
     assert "XLA_FLAGS" not in environment
     assert "JAX_ENABLE_X64" not in environment
     assert environment["OMP_NUM_THREADS"] == "2"
@@ -207,15 +210,8 @@ def test_tables_and_figures_come_from_the_file_alone(tmp_path, capsys):
         }
     }  # fmt: skip
     report.save_section(tmp_path / "bench.json", results)
-    arguments = [
-        "bench",
-        "--json",
-        str(tmp_path / "bench.json"),
-        "--figures",
-        str(tmp_path / "f"),
-        "--draw-only",
-    ]
-    assert main(arguments) == 0
+    words = ["--json", str(tmp_path / "bench.json"), "--figures", str(tmp_path / "f"), "--draw-only"]
+    assert bench.main(words) == 0
     names = {path.name for path in (tmp_path / "f").iterdir()}
     assert names == {
         "bench_speed.png",
@@ -233,41 +229,61 @@ def test_tables_and_figures_come_from_the_file_alone(tmp_path, capsys):
 def test_a_section_run_alone_leaves_the_others_in_the_file(tmp_path, capsys, monkeypatch):
     path = tmp_path / "bench.json"
     report.save_section(path, {"sections": {"joint": measured("joint", [case("joint shield", {})])}})
-    asked = []
+    asked, advice = [], "it needs: pip install '.[bench]'"
 
     def answer(case):
         asked.append(case)
-        return {"name": case.name, "threads": 1, "settings": case.settings, "missing": "no accelerator"}
+        return {"name": case.name, "threads": 1, "settings": case.settings, "missing": advice}
 
     monkeypatch.setattr(report, "run_case", answer)
-    assert main(["bench", "gpu", "--json", str(path), "--quick"]) == 0
+    assert bench.main(["gpu", "--json", str(path), "--quick"]) == 0
     kept = json.loads(path.read_text())["sections"]
     assert set(kept) == {"joint", "gpu"}
-    assert kept["gpu"]["summary"] == {"nothing_measured": "no accelerator"}
+    assert kept["gpu"]["summary"] == {"nothing_measured": advice}
+    assert advice in capsys.readouterr().out
     assert kept["gpu"]["machine"]["cores"] >= 1
     assert {"jax", "sidestep", "python"} <= set(kept["gpu"]["versions"])
     assert len(asked) == 1
 
 
 def test_bad_input_is_refused_before_anything_is_measured(tmp_path, capsys):
-    assert main(["bench", "flter"]) == 2
+    assert bench.main(["flter"]) == 2
     assert "no section 'flter'" in capsys.readouterr().err
     other = tmp_path / "other.json"
     other.write_text("[1]")
-    assert main(["bench", "gpu", "--json", str(other)]) == 2
+    assert bench.main(["gpu", "--json", str(other)]) == 2
     assert other.read_text() == "[1]"
-    assert main(["bench", "--draw-only"]) == 2
+    assert bench.main(["--draw-only"]) == 2
+
+
+@pytest.mark.parametrize("option", ["--json", "--figures"])
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_measured(option, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    assert bench.main(["filter", option, str(tmp_path / "file" / "below")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("bench.py: ")
+    assert "could not be written" in captured.err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_the_script_runs_from_any_folder(tmp_path):
+    words = [sys.executable, str(BENCHMARKS / "bench.py"), "--help"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert all(name in done.stdout for name in SECTIONS)
 
 
 def test_importing_the_benchmark_imports_no_peer():
     code = """
 import importlib, sys
-from sidestep.bench.sections import SECTIONS
+from speed.sections import SECTIONS
 for name in [*SECTIONS, "filter_peers", "rejax_task"]:
-    importlib.import_module(f"sidestep.bench.{name}")
+    importlib.import_module(f"speed.{name}")
 peers = ("torch", "stable_baselines3", "sbx", "rejax", "qpax", "cbfpy", "osqp", "clarabel")
 print([name for name in peers if name in sys.modules])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=BENCHMARKS, capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "[]", done.stdout
     assert children.MOST_SECONDS <= 300

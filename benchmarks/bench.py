@@ -1,15 +1,21 @@
-"""`sidestep bench`."""
+"""How fast is it, beside the peers that are installed? Run nothing else meanwhile.
+
+python benchmarks/bench.py --json FILE --figures FOLDER
+python benchmarks/bench.py filter joint --quick
+"""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from sidestep.store.outputs import try_outputs
+from speed.report import draw, load_results, run_section, save_section, summary_lines
+from speed.sections import SECTIONS, section
 
 
 @dataclass(frozen=True)
@@ -28,12 +34,8 @@ class Bench:
     """Run nothing: draw --figures from what the --json file holds."""
 
 
-def run(command: Bench, console: Console) -> int:
-    """Run `sidestep bench`; returns the exit status."""
-    from sidestep.bench.report import draw, load_results, run_section, save_section, summary_lines
-    from sidestep.bench.sections import SECTIONS, section
-    from sidestep.store.outputs import try_outputs
-
+def run(command: Bench) -> int:
+    """Measure and draw; returns 1 if a case ended with an error."""
     names = command.sections or tuple(SECTIONS)
     for name in names:
         section(name)  # a wrong name ends it before anything is measured
@@ -43,14 +45,30 @@ def run(command: Bench, console: Console) -> int:
     results: dict[str, Any] = load_results(command.json)
     failed = False
     for name in () if command.draw_only else names:
-        console.print(f"[bold]{name}[/bold]: {SECTIONS[name]}")
-        measured = run_section(name, command.quick, lambda line: console.print(f"  {line}", highlight=False))
+        print(f"{name}: {SECTIONS[name]}", flush=True)
+        measured = run_section(name, command.quick, lambda line: print(f"  {line}", flush=True))
         results.setdefault("sections", {})[name] = measured
         # Section by section: what has been measured survives an interruption.
         save_section(command.json, results)
-        console.print("\n".join(summary_lines(measured["summary"], "  ")), highlight=False)
+        print("\n".join(summary_lines(measured["summary"], "  ")), flush=True)
         failed = failed or any("error" in case for case in measured["cases"])
     if command.figures is not None:
         for path in draw(results, command.figures):
-            console.print(f"{path}", highlight=False)
+            print(path)
     return 1 if failed else 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Bad input ends with a message and exit status 2, Ctrl-C with 130."""
+    command = tyro.cli(Bench, prog="bench.py", args=arguments)
+    try:
+        return run(command)
+    except ValueError as error:
+        print(f"bench.py: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
