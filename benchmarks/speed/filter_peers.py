@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from speed.filter import LIMIT, SINGLES, Problems, Side
+from speed.filter_problems import LIMIT, SINGLES, Problems, Side
 from speed.peers import peer
 
 

@@ -67,7 +67,8 @@ def _worlds(settings: dict[str, Any]) -> tuple[Any, int, str]:
 
 
 def _filter(settings: dict[str, Any]) -> tuple[Any, int, str]:
-    from speed.filter import make_side, problems
+    from speed.filter import make_side
+    from speed.filter_problems import problems
 
     side = make_side("ours", problems(settings["size"], settings["rows"]))
     return lambda _: side.batch(), settings["size"], "problems/s"

@@ -49,7 +49,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         return world, shield.init(world)
 
     @eqx.filter_jit
-    def wish(world: Any) -> Any:
+    def nominal_of(world: Any) -> Any:
         return to_velocity(scenario, world, jnp.asarray(AHEAD, world.evader.dtype))
 
     @eqx.filter_jit
@@ -59,7 +59,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
 
     decide, key = eqx.filter_jit(shield), jax.random.key(0)
     world, memory = begin(key)
-    nominal = jax.block_until_ready(wish(world))
+    nominal = jax.block_until_ready(nominal_of(world))
     (result, _), compiling = first_call(lambda: jax.block_until_ready(decide(world, nominal, memory)))
     jax.block_until_ready(move(world, result.action, key))
 
@@ -72,7 +72,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         world, memory = begin(start_key)
         ended, period = False, 0
         while not ended:
-            nominal = jax.block_until_ready(wish(world))
+            nominal = jax.block_until_ready(nominal_of(world))
             begun = time.perf_counter()
             result, memory = jax.block_until_ready(decide(world, nominal, memory))
             spent = time.perf_counter() - begun

@@ -126,7 +126,8 @@ def _stepped(scenario: Any, starts: Any, settings: dict[str, Any]) -> tuple[floa
 
 
 def _rows(settings: dict[str, Any]) -> Points:
-    from speed.filter import make_side, problems
+    from speed.filter import make_side
+    from speed.filter_problems import problems
 
     for rows in settings["sizes"]:
         side = make_side(settings["side"], problems(PROBLEMS, rows))

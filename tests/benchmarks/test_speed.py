@@ -16,6 +16,7 @@ from speed import children, filter_peers, learning, process, report, roofline, s
 from speed import filter as filter_section
 from speed.children import Case, run_case
 from speed.figures import draw_all
+from speed.filter_problems import disagreement, problems
 from speed.peers import MissingPeer, peer
 from speed.sections import SECTIONS, section
 
@@ -24,9 +25,9 @@ BENCHMARKS = Path(bench.__file__).parent
 
 @pytest.mark.parametrize("rows", [2, 8])
 def test_ours_and_the_exact_answer_agree_where_the_disc_is_not_active(rows):
-    given = filter_section.problems(300, rows)
+    given = problems(300, rows)
     side = filter_section.make_side("ours", given)
-    apart = filter_section.disagreement(given, side.answers(side.batch()))
+    apart = disagreement(given, side.answers(side.batch()))
     assert apart["compared"] > 100
     assert apart["largest_difference"] < 1e-3
     assert apart["median_difference"] < 1e-6
@@ -37,17 +38,17 @@ def test_ours_and_the_exact_answer_agree_where_the_disc_is_not_active(rows):
 @pytest.mark.parametrize("rows", [2, 8])
 def test_the_exact_answer_is_that_of_another_solver(rows):
     """Clarabel is a test dependency anyway; it keeps the disc too."""
-    given = filter_section.problems(60, rows, seed=2)
+    given = problems(60, rows, seed=2)
     side = filter_peers.clarabel(given)
-    apart = filter_section.disagreement(given, side.answers(side.batch()))
+    apart = disagreement(given, side.answers(side.batch()))
     assert apart["compared"] > 20
     assert apart["largest_difference"] < 1e-4
 
 
 def test_a_wrong_answer_does_not_pass_for_agreement():
-    given = filter_section.problems(50, 2)
+    given = problems(50, 2)
     wrong = given.nominal + np.array([0.01, 0.0])
-    assert filter_section.disagreement(given, wrong)["largest_difference"] > 0.005
+    assert disagreement(given, wrong)["largest_difference"] > 0.005
 
 
 def test_the_filter_has_no_matrix_product_that_tf32_could_round():
