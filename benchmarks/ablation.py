@@ -11,16 +11,15 @@ core, so that several run side by side without disturbing one another.
 """
 
 import argparse
-import importlib.metadata
 import json
 import multiprocessing
 import os
-import platform
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from machine import machine, versions
 from sidestep._compiled import thread_limits
 
 EVALUATION_SEED = 1000
@@ -202,20 +201,10 @@ def replay_action_table(runs: list[dict[str, Any]]) -> str:
     return "\n".join([*training, "", *trained, ""])
 
 
-def _machine() -> dict[str, Any]:
-    return {
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "cores": os.cpu_count(),
-            "threads": 1,
-        },
-        "versions": {
-            name: importlib.metadata.version(name) for name in ("sidestep", "jax", "equinox", "optax")
-        },
-    }
-
-
 def main() -> None:
+    # Not at the top: NumPy comes with it, and a training limits its threads first.
+    from sidestep.store.files import write_json
+
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -262,7 +251,6 @@ def main() -> None:
         for variant in variants
         if (variant, seed) not in known
     ]
-    out.parent.mkdir(parents=True, exist_ok=True)
     # Spawned and never reused, so that every training starts from the same clean process.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.processes, mp_context=context, max_tasks_per_child=1) as pool:
@@ -277,12 +265,11 @@ def main() -> None:
             order = list(usual.variants)
             report = {
                 "study": study,
-                **_machine(),
+                "machine": {**machine(), "threads": 1},
+                "versions": versions(),
                 "runs": sorted(done, key=lambda r: (order.index(r["variant"]), r["seed"])),
             }
-            beside = out.with_suffix(".tmp")
-            beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-            os.replace(beside, out)
+            write_json(out, report)
     if arguments.table is not None and done:
         make = additions_table if study == "additions" else replay_action_table
         arguments.table.write_text(make(done), encoding="utf-8")

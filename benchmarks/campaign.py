@@ -21,7 +21,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from study_blocks import machine, write
+from machine import load, machine
+from sidestep.store.files import write_json
 
 FILE = """
 [grid]
@@ -43,10 +44,6 @@ def command(folder: Path, name: str, workers: int) -> list[str]:
 
 def plan(folder: Path, name: str, **values: Any) -> None:
     (folder / f"{name}.toml").write_text(FILE.format(**values), encoding="utf-8")
-
-
-def load() -> float:
-    return round(os.getloadavg()[0], 2)
 
 
 def measured(folder: Path, name: str, workers: int) -> dict[str, Any]:
@@ -147,7 +144,9 @@ def drill(folder: Path, count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--jobs", type=int, default=200)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--shield", default="game")
@@ -170,7 +169,7 @@ def main() -> None:
         }
         print(json.dumps(report["drill"], indent=1), flush=True)
         report["scaling"] = scaling(folder, options.rounds)
-    write(options.out, report)
+    write_json(options.out, report)
     print(json.dumps(report["scaling"], indent=1))
 
 

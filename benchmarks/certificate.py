@@ -10,12 +10,11 @@ and a hundredth above it, where it must break, or else the attack would prove no
 
 import argparse
 import dataclasses
-import json
-import platform
 import time
 from pathlib import Path
 from typing import Any
 
+from machine import machine
 from sidestep.safety.certificate.greedy_chase import chase
 from sidestep.safety.certificate.sampled_design import (
     FINE,
@@ -28,6 +27,7 @@ from sidestep.safety.certificate.sampled_design import (
 )
 from sidestep.safety.certificate.sampled_game import Design, SampledGame
 from sidestep.safety.certificate.shield_check import shield_level
+from sidestep.store.files import write_json
 from sidestep.world import load_scenario
 
 PAPER = SampledGame(evader_speed=0.1574, pursuer_speed=0.2, half_axle=0.2, control_period=0.05)
@@ -103,16 +103,15 @@ def main() -> None:
     guarded = shield_level(load_scenario("paper", capture_distance=0.198))
     print(f"game shield set to 0.198 m at 20 Hz keeps {guarded.level:.4f} m")
     if options.out is not None:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         result = {
             "rows": rows,
             "longest_period": longest,
             "shield_at_0.198": dataclasses.asdict(guarded),
             "seed": options.seed,
             "seconds": time.perf_counter() - began,
-            "machine": platform.processor() or platform.machine(),
+            "machine": machine(),
         }
-        options.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write_json(options.out, result)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ medians over the rounds.
 """
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,8 @@ import jax
 import numpy as np
 
 import sidestep.bridges.gym
-from machine import load, machine, versions
+from machine import conditions, load
+from sidestep.store.files import write_json
 from speed.gymnasium_task import make_environment
 
 PURSUER = "turn-then-drive"
@@ -127,18 +127,14 @@ def main() -> None:
             )
     if options.json is not None:
         result = {
-            "machine": machine(),
-            "versions": versions(),
-            "load before": before,
-            "load after": load(),
+            **conditions(before),
             "worlds": options.worlds,
             "rounds": options.rounds,
             "seconds": options.seconds,
             "pursuer": PURSUER,
             "cases": cases,
         }
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write_json(options.json, result)
 
 
 if __name__ == "__main__":

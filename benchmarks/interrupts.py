@@ -32,6 +32,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sidestep.store.files import write_json
+
 SMALL = ["--set", "episode_steps=200", "--learner", "hidden=[32, 32]", "batch_size=32", "warmup_decisions=40"]
 CAMPAIGN = """kind = "evaluate"
 [grid]
@@ -237,7 +239,7 @@ def main() -> int:
                 for fault in study.faults:
                     print(f"  {fault}", flush=True)
                 if options.out is not None:
-                    options.out.write_text(json.dumps(results, indent=2) + "\n")
+                    write_json(options.out, results)
         finally:
             for process in busy:
                 process.kill()

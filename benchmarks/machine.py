@@ -1,4 +1,4 @@
-"""On what was it measured: processor, versions, load."""
+"""On what was it measured: processor, versions, load. For every benchmark's JSON file."""
 
 from __future__ import annotations
 
@@ -49,13 +49,20 @@ def machine() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def versions() -> dict[str, str | None]:
-    """Python's version and those of all packages that take part."""
+def versions(*more: str) -> dict[str, str | None]:
+    """Python's version and those of all packages that take part, `more` packages too."""
     from sidestep import __version__
 
     # A source folder on the path has no metadata of its own.
     return {
         "python": platform.python_version(),
-        **{name: version(name) for name in PACKAGES},
+        **{name: version(name) for name in (*PACKAGES, *more)},
         "sidestep": __version__,
     }
+
+
+def conditions(load_before: float | None) -> dict[str, Any]:
+    """Machine, versions, and the load at the start and now."""
+    return {
+        "machine": machine(), "versions": versions(), "load before": load_before, "load after": load(),
+    }  # fmt: skip

@@ -20,7 +20,6 @@ it stopped, and one that is asked for more blocks adds them. It uses an accelera
 """
 
 import argparse
-import importlib.metadata
 import json
 import time
 from dataclasses import dataclass, field
@@ -28,6 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import study_blocks
+from machine import machine, versions
+from sidestep.store.files import write_json
 
 STOP_SHORT = 0.02
 """Distance (m) from the target at which `stay` holds still."""
@@ -217,12 +218,12 @@ def _write(path: Path, settings: dict[str, Any], blocks: list[dict[str, Any]]) -
     report = {
         "what": f"episodes behind the {settings['shield']} shield: captures and collisions",
         "settings": settings,
-        "machine": study_blocks.machine() | {"device": jax.devices()[0].device_kind},
-        "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "jax", "numpy")},
+        "machine": machine() | {"device": jax.devices()[0].device_kind},
+        "versions": versions(),
         **summary(blocks),
         "blocks": sorted(blocks, key=lambda b: (b["pursuer"], b["policy"], b["block"])),
     }  # fmt: skip
-    study_blocks.write(path, report)
+    write_json(path, report)
 
 
 def main() -> None:

@@ -28,7 +28,8 @@ import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from machine import load, machine, versions
+from machine import conditions, load
+from sidestep.store.files import write_json
 
 SCREENS = {"laptop": (1280, 760, 1), "projector": (1920, 1080, 1), "phone": (390, 844, 2)}
 """Width and height in CSS pixels, and how many real ones each is wide."""
@@ -55,14 +56,11 @@ def main() -> None:
         figures["disturbed"] = asyncio.run(disturbed(server))
         figures["screens"] = seen_in_chromium(server, options)
         figures["memory_mib_at_the_end"] = server.memory_mib()
-    result = {
-        "machine": machine(), "versions": versions(), "load before": before, "load after": load(),
-        "options": {"rate": options.rate, "shield": options.shield, "seconds": options.seconds}, **figures,
-    }  # fmt: skip
+    settings = {"rate": options.rate, "shield": options.shield, "seconds": options.seconds}
+    result = {**conditions(before), "options": settings, **figures}
     print(json.dumps(figures, indent=2))
     if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write_json(options.json, result)
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,6 @@ quarter of the plane is enough.
 
 import argparse
 import functools
-import importlib.metadata
-import json
-import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +28,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+import study_blocks
+from machine import machine, versions
+from sidestep.store.files import write_json
 
 CASES: dict[str, tuple[float, float, float, float]] = {
     "paper": (0.1574, 0.2, 0.2, 0.2),
@@ -110,7 +110,7 @@ class _Grid:
             (i, u), (j, v) = (divmod(part / self.spacing, 1.0) for part in move)
             i, j = self.margin + int(i), self.margin + int(j)
             rows = padded[i - 1 : i + n + 2]
-            columns = sum(w * rows[:, j - 1 + k : j - 1 + k + n] for k, w in enumerate(_cubic(v)))
+            columns: Any = sum(w * rows[:, j - 1 + k : j - 1 + k + n] for k, w in enumerate(_cubic(v)))
             for beside in (self.margin - 1 - j, self.margin - j):
                 if 0 <= beside < n:
                     columns[:, beside] = (1.0 - v) * rows[:, j + beside] + v * rows[:, j + beside + 1]
@@ -378,25 +378,17 @@ def main() -> None:
     arguments = parser.parse_args()
 
     settings = {"reach": REACH, "step_cells": STEP_CELLS, "headings": arguments.headings}
-    done: list[dict[str, Any]] = []
-    if arguments.out.exists():
-        earlier = json.loads(arguments.out.read_text(encoding="utf-8"))
-        if earlier["settings"] != settings:
-            raise SystemExit(f"{arguments.out} was made with other settings, {earlier['settings']}")
-        done = earlier["runs"]
+    done: list[dict[str, Any]] = study_blocks.earlier(arguments.out, settings).get("runs", [])
 
     def keep(runs: list[dict[str, Any]]) -> None:
         report = {
             "what": "pursuit barrier and time to capture against a grid solution, errors in m and s",
             "settings": settings,
-            "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
-            "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "jax", "numpy")},
+            "machine": machine(),
+            "versions": versions(),
             "runs": runs,
         }
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        beside = arguments.out.with_suffix(".tmp")
-        beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        os.replace(beside, arguments.out)
+        write_json(arguments.out, report)
 
     try:
         study(arguments.cells, arguments.headings, done, keep)

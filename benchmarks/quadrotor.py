@@ -9,7 +9,6 @@ is trained first unless `--run` names its folder. Every row of the table is what
 """
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from sidestep.commands.fly import flight_counts
 from sidestep.learning import load_policy
 from sidestep.learning import train as run_training
 from sidestep.plants.air import FlightOptions, Pilot, certificate_of, errors_of, fly
+from sidestep.store.files import write_json
 from sidestep.world import load_scenario, scenario_to_dict
 
 PURSUERS = ("chauffeur", "nash", "turn-while-driving")
@@ -80,7 +80,7 @@ def main() -> None:
                 words = {key: value for key, value in row.items() if key in KEPT}
                 print(shield, name, pursuer, words, flush=True)
                 if arguments.json is not None:
-                    arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+                    write_json(arguments.json, report)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sidestep_ros.recorder import Recorder, values_of
 
-from machine import load, machine, versions
+from machine import conditions, load
+from sidestep.store.files import write_json
 
 _PATIENCE = 300.0
 
@@ -42,14 +43,11 @@ def main() -> None:
     options = parser.parse_args()
     before = load()
     figures = measure(options)
-    result = {
-        "machine": machine(), "versions": versions(), "load before": before, "load after": load(),
-        "options": {name: str(value) for name, value in vars(options).items() if name != "json"}, **figures,
-    }  # fmt: skip
+    settings = {name: str(value) for name, value in vars(options).items() if name != "json"}
+    result = {**conditions(before), "options": settings, **figures}
     print(json.dumps(figures, indent=2))
     if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write_json(options.json, result)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

@@ -1,9 +1,8 @@
-"""A study in blocks of episodes: worked on by processes, written down block by block."""
+"""A study in blocks of episodes: worked on by processes, and continued from what an earlier run wrote."""
 
 import json
 import multiprocessing
 import os
-import platform
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,14 +26,6 @@ def _alone() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def write(path: Path, report: dict[str, Any]) -> None:
-    """Replaces the report as a whole, so that an interrupted study leaves the one before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".tmp")
-    beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    os.replace(beside, path)
-
-
 def earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """The report to go on with; empty if there is none. Ends the program if its settings were others."""
     if not path.exists():
@@ -43,8 +34,3 @@ def earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     if report["settings"] != settings:
         raise SystemExit(f"{path} was made with other settings, {report['settings']}")
     return report
-
-
-def machine() -> dict[str, Any]:
-    """Where a study ran."""
-    return {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}

@@ -18,7 +18,6 @@ it stopped, and one that is asked for more blocks adds them.
 """
 
 import argparse
-import importlib.metadata
 import math
 import time
 import warnings
@@ -26,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import study_blocks
+from machine import machine, versions
+from sidestep.store.files import write_json
 
 SCENARIOS = {"paper": {}, "roomy": {"capture_distance": 0.15}, "wide": {"capture_distance": 0.1}}
 NOISES = (0.0, 0.002, 0.005, 0.01, 0.02)
@@ -61,7 +62,7 @@ def verdict(scenario: str, noise: float, delay: float) -> dict[str, Any]:
     from sidestep.safety import certify
 
     chosen = _scenario(scenario)
-    errors = bounded_errors(chosen, _options("servo", noise, delay))
+    errors: dict[str, Any] = bounded_errors(chosen, _options("servo", noise, delay))
     certificate = certify(chosen, **errors, check_shield=False)
     return {
         "scenario": scenario,
@@ -140,13 +141,13 @@ def _write(path: Path, settings: dict[str, Any], blocks: list[Any], verdicts: li
     report = {
         "what": "episodes on the physics twin over noise and delay, beside the certificate's verdict",
         "settings": settings,
-        "machine": study_blocks.machine(),
-        "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "mujoco", "jax")},
+        "machine": machine(),
+        "versions": versions("mujoco"),
         "cells": summary(blocks, verdicts),
         "verdicts": verdicts,
         "blocks": sorted(blocks, key=lambda block: (*_cell(block), block["block"])),
     }
-    study_blocks.write(path, report)
+    write_json(path, report)
 
 
 def main() -> None:

@@ -85,9 +85,9 @@ def load_results(path: Path | None) -> dict[str, Any]:
 def save_section(path: Path | None, results: dict[str, Any]) -> None:
     """Write all sections to `path`, if there is one."""
     if path is not None:
-        from sidestep.store.files import json_safe, write_json
+        from sidestep.store.files import write_json
 
-        write_json(path, json_safe(results))
+        write_json(path, results)
 
 
 HEADER = ("", "threads", "per second", "p50", "p99", "worst", "compiling, s", "memory, MiB")
