@@ -1,32 +1,21 @@
 """The ablation studies: do they compare what they say, and go on where they stopped?"""
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
 
 import pytest
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "ablation.py"
+import ablation as study
 
 
-@pytest.fixture(scope="module")
-def study():
-    spec = importlib.util.spec_from_file_location("ablation", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["ablation"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["ablation"]
-
-
-def stored(study, name):
-    data = json.loads((PATH.parent / "results" / study.STUDIES[name].file).read_text())
+def stored(name):
+    data = json.loads((Path(study.__file__).parent / "results" / study.STUDIES[name].file).read_text())
     return data["runs"] if isinstance(data, dict) else data
 
 
 @pytest.mark.parametrize("name", ["additions", "replay-action"])
-def test_every_variant_is_a_training_that_can_be_asked_for(study, name):
+def test_every_variant_is_a_training_that_can_be_asked_for(name):
     from sidestep.learning import make_options, options_to_dict
 
     made = []
@@ -37,8 +26,8 @@ def test_every_variant_is_a_training_that_can_be_asked_for(study, name):
 
 
 @pytest.mark.parametrize("name", ["additions", "replay-action"])
-def test_finished_study_is_tabulated_without_training_again(study, name, tmp_path, monkeypatch):
-    runs = stored(study, name)
+def test_finished_study_is_tabulated_without_training_again(name, tmp_path, monkeypatch):
+    runs = stored(name)
     out, table = tmp_path / "study.json", tmp_path / "table.md"
     out.write_text(json.dumps(runs))
     seeds = str(len({run["seed"] for run in runs}))
@@ -56,9 +45,9 @@ def test_finished_study_is_tabulated_without_training_again(study, name, tmp_pat
 
 
 @pytest.mark.parametrize("other", [["--episodes", "7"], ["--shield", "paper"], ["--hidden", "8"]])
-def test_trainings_with_other_settings_are_not_mixed(study, other, tmp_path, monkeypatch, capsys):
+def test_trainings_with_other_settings_are_not_mixed(other, tmp_path, monkeypatch, capsys):
     out = tmp_path / "study.json"
-    out.write_text(json.dumps(stored(study, "replay-action")))
+    out.write_text(json.dumps(stored("replay-action")))
     monkeypatch.setattr(sys, "argv", ["ablation", "--study", "replay-action", "--out", str(out), *other])
     with pytest.raises(SystemExit):
         study.main()

@@ -1,30 +1,18 @@
 """The studies of many episodes: do they count right, and go on where they stopped?"""
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import many_episodes as study
 from sidestep.world import load_scenario, observation_names
-
-PATH = Path(__file__).parents[2] / "benchmarks" / "many_episodes.py"
-
-
-@pytest.fixture(scope="module")
-def study():
-    spec = importlib.util.spec_from_file_location("many_episodes", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["many_episodes"] = module  # where its dataclass looks for its annotations
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
-def run(study, tmp_path, monkeypatch):
+def run(tmp_path, monkeypatch):
     """`run("--blocks", "2")`: the command on a small study; its report."""
 
     def call(*options):
@@ -38,7 +26,7 @@ def run(study, tmp_path, monkeypatch):
     return call
 
 
-def test_an_interrupted_study_goes_on_and_comes_to_the_same(study, run, monkeypatch, capsys):
+def test_an_interrupted_study_goes_on_and_comes_to_the_same(run, monkeypatch, capsys):
     whole_block, calls = study.run_block, []
 
     def interrupted(job):
@@ -73,7 +61,7 @@ def test_an_interrupted_study_goes_on_and_comes_to_the_same(study, run, monkeypa
         run("--seed", "1")
 
 
-def test_captures_are_counted_and_can_be_found_again(study):
+def test_captures_are_counted_and_can_be_found_again():
     blocks = [
         {"pursuer": p, "policy": "stay", "block": b, "episodes": 10, "captured": c, "collided": 0,
          "reached": 0, "timed_out": 10 - c, "env_steps": 5, "smallest_distance": d,
@@ -91,7 +79,7 @@ def test_captures_are_counted_and_can_be_found_again(study):
     assert [each["episodes"] for each in report["each"]] == [20, 10]
 
 
-def test_the_policies_never_finish_and_do_what_they_are_called(study):
+def test_the_policies_never_finish_and_do_what_they_are_called():
     scenario = load_scenario("paper", **study.STUDIES["game"].fields)
     names = observation_names(scenario)
     assert names[1] == "target_near"
@@ -103,7 +91,7 @@ def test_the_policies_never_finish_and_do_what_they_are_called(study):
     np.testing.assert_allclose(study._policy("reckless")(seen), [-0.6, 0.8], rtol=1e-6)
 
 
-def test_the_joint_studies_ask_for_what_they_say(study):
+def test_the_joint_studies_ask_for_what_they_say():
     joint = study.STUDIES["joint"]
     assert joint.block * joint.blocks["nash"] == 20_000
     assert joint.block * joint.other == 5_000

@@ -1,27 +1,13 @@
 """The pursuit barrier is the value of the game: against a solution on a grid that knows no closed form."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "pursuit_barrier_grid.py"
+import pursuit_barrier_grid as grid
 
 
 @pytest.fixture(scope="module")
-def grid():
-    spec = importlib.util.spec_from_file_location("pursuit_barrier_grid", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
-
-
-@pytest.fixture(scope="module")
-def fast_evader(grid):
+def fast_evader():
     """The paper's speeds, on a coarse grid and on one half as fine."""
     return {cells: grid.bracket(0.1574 / 0.2, cells, levels=(0.5, 1.25)) for cells in (24, 48)}
 
@@ -29,7 +15,7 @@ def fast_evader(grid):
 WAYS = ("pursuer_knows", "evader_knows")
 
 
-def test_where_the_evader_escapes_the_grids_value_is_the_barrier(grid, fast_evader):
+def test_where_the_evader_escapes_the_grids_value_is_the_barrier(fast_evader):
     """l = 0.1 m, half of the largest: 0 <= h <= h_max is a strip 0.1 m wide."""
     case = grid.CASES["well below the largest capture distance"]
     coarse, fine = (grid.compare(case, fast_evader[cells]) for cells in (24, 48))
@@ -47,14 +33,14 @@ def test_where_the_evader_escapes_the_grids_value_is_the_barrier(grid, fast_evad
     assert np.all(low <= high + 1e-3)
 
 
-def test_a_barrier_of_another_game_does_not_agree(grid, fast_evader):
+def test_a_barrier_of_another_game_does_not_agree(fast_evader):
     """The comparison can fail: speeds a few percent off, or an axle, give ten times the error."""
     right = grid.compare((0.1574, 0.2, 0.2, 0.1), fast_evader[48])["midway"]["barrier"]["mean_absolute"]
     for wrong in ((0.147, 0.2, 0.2, 0.1), (0.168, 0.2, 0.2, 0.1)):
         assert grid.compare(wrong, fast_evader[48])["midway"]["barrier"]["mean_absolute"] > 10.0 * right
 
 
-def test_where_the_pursuer_wins_everybody_is_caught_and_when_the_game_says(grid):
+def test_where_the_pursuer_wins_everybody_is_caught_and_when_the_game_says():
     case = grid.CASES["slow evader"]
     report = grid.compare(
         case, grid.bracket(case[0] / case[1], 48, levels=(case[3] / case[2],), longest=15.0)
@@ -68,7 +54,7 @@ def test_where_the_pursuer_wins_everybody_is_caught_and_when_the_game_says(grid)
         assert report[way]["capture_time"]["largest_absolute"] < 0.12
 
 
-def test_a_larger_capture_distance_than_the_largest_loses_the_whole_plane(grid, fast_evader):
+def test_a_larger_capture_distance_than_the_largest_loses_the_whole_plane(fast_evader):
     """l = 0.25 m at the paper's speeds: l_max = 0.2008 m."""
     report = grid.compare(grid.CASES["larger capture distance"], fast_evader[48])
     assert not report["evader_can_escape"]
@@ -77,7 +63,7 @@ def test_a_larger_capture_distance_than_the_largest_loses_the_whole_plane(grid, 
 
 
 @pytest.mark.slow
-def test_the_error_vanishes_as_the_grid_is_refined(grid):
+def test_the_error_vanishes_as_the_grid_is_refined():
     case = grid.CASES["well below the largest capture distance"]
     errors, plateaus = [], []
     for cells in (48, 96, 144):

@@ -1,25 +1,15 @@
 """The study of noise and delay on the twin: does it count right, go on where it stopped, and judge fairly?"""
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "twin.py"
-
-
-@pytest.fixture(scope="module")
-def study():
-    spec = importlib.util.spec_from_file_location("twin_study", PATH)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+import twin as study
 
 
 @pytest.mark.slow
-def test_an_interrupted_study_goes_on_where_it_stopped(study, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_study_goes_on_where_it_stopped(tmp_path, monkeypatch, capsys):
     out, whole_block, calls = tmp_path / "twin.json", study.run_block, []
 
     def interrupted(job):
@@ -56,7 +46,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(study, tmp_path, monkeypa
         run("--seed", "1")
 
 
-def test_a_guarantee_that_was_broken_shows(study):
+def test_a_guarantee_that_was_broken_shows():
     block = {
         "scenario": "roomy", "base": "servo", "noise": 0.0, "delay": 0.0, "block": 0, "episodes": 10,
         "captured": 0, "collided": 1, "reached": 9, "timed_out": 0, "cut": 0,
@@ -73,7 +63,7 @@ def test_a_guarantee_that_was_broken_shows(study):
     assert cell["captured_rate_low"] < 0.1 < cell["captured_rate_high"]
 
 
-def test_a_cell_is_measured_with_the_errors_it_names(study):
+def test_a_cell_is_measured_with_the_errors_it_names():
     options = study._options("omniwheels", 0.004, 0.05)
     assert options.base == "omniwheels"
     assert options.sensors.position_noise == 0.004
