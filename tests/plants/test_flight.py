@@ -25,7 +25,8 @@ from sidestep.plants.air import (
     frames_of,
 )
 from sidestep.plants.air.estimate import OwnMotion
-from sidestep.plants.ground import Sensors, TwinError
+from sidestep.plants.library import TwinError
+from sidestep.plants.sensors import Sensors
 from sidestep.safety import make_shield
 from sidestep.world import Quadrotor, load_scenario
 

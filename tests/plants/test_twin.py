@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.plants.ground import SENSORS, Sensors, Twin, TwinError, TwinOptions, library, make_sensors
+from sidestep.plants import library
+from sidestep.plants.ground import SENSORS, Sensors, Twin, TwinError, TwinOptions, make_sensors
 from sidestep.plants.ground.actuation import omniwheel_speeds
 from sidestep.plants.ground.robots import OMNIWHEEL_ROLLING
-from sidestep.plants.ground.sensors import PoseSensor
+from sidestep.plants.sensors import PoseSensor
 from sidestep.world import World, load_scenario
 from sidestep.world.robots import drive
 

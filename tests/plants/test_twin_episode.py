@@ -8,19 +8,19 @@ import pytest
 
 from sidestep.cli import main
 from sidestep.loop import load_trajectory, rollout, save_trajectory
+from sidestep.plants import library
 from sidestep.plants.ground import (
     SENSORS,
     Contacts,
     TwinError,
     TwinOptions,
     frames_of,
-    library,
     run_twin,
     settings_for,
     twin_episode,
     write_video,
 )
-from sidestep.plants.ground.record import events_of
+from sidestep.plants.record import events_of
 from sidestep.robot import Onboard
 from sidestep.safety import Status
 from sidestep.views.scene import world_at

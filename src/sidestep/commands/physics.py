@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from sidestep.commands.fly import Fly
     from sidestep.commands.twin import Twin
-    from sidestep.plants.ground.record import PhysicsEpisode
+    from sidestep.plants.record import PhysicsEpisode
 
 
 @dataclass(frozen=True)

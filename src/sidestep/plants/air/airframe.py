@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sidestep.plants.ground.robots import mjcf_colour, studio
+from sidestep.plants.drawing import mjcf_colour, studio
 from sidestep.world.flyers import GRAVITY
 
 ROTORS = ("front_left", "rear_left", "rear_right", "front_right")

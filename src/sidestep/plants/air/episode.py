@@ -18,7 +18,7 @@ from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.step import decide, decision_steps_of
 from sidestep.plants.air.flight import Flight
 from sidestep.plants.air.options import FlightOptions, budget_of, check_scenario, errors_of
-from sidestep.plants.ground.record import (
+from sidestep.plants.record import (
     Log,
     PhysicsEpisode,
     estimate_error,

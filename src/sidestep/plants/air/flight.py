@@ -12,9 +12,9 @@ from sidestep.plants.air.airframe import ROTORS, scene_xml
 from sidestep.plants.air.autopilot import Attitude, Autopilot, Setpoint
 from sidestep.plants.air.estimate import OwnMotion
 from sidestep.plants.air.options import FlightOptions, check_scenario
-from sidestep.plants.ground import Contacts, Measurement, TwinError, Watch
-from sidestep.plants.ground.library import check_robots, load_mujoco
-from sidestep.plants.ground.sensors import PoseSensors
+from sidestep.plants.contacts import Contacts, Watch
+from sidestep.plants.library import TwinError, check_robots, load_mujoco
+from sidestep.plants.sensors import Measurement, PoseSensors
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER
 from sidestep.world import Scenario, World
 from sidestep.world.flyers import GRAVITY, Quadrotor

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 
 from sidestep.plants.air.airframe import Airframe
 from sidestep.plants.air.autopilot import Gains
-from sidestep.plants.ground import PURSUER_SEES, Sensors, TwinError
+from sidestep.plants.ground import PURSUER_SEES
+from sidestep.plants.library import TwinError
+from sidestep.plants.sensors import Sensors
 from sidestep.safety import Budget
 from sidestep.world import Scenario
 from sidestep.world.flyers import GRAVITY, Quadrotor

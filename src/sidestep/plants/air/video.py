@@ -12,8 +12,8 @@ from jaxtyping import Float, UInt8
 
 from sidestep.plants.air.episode import FlightEpisode
 from sidestep.plants.air.flight import Flight
-from sidestep.plants.ground.drawing import Decor, camera_over, rgba, thinned
-from sidestep.plants.ground.library import load_mujoco, make_renderer
+from sidestep.plants.drawing import Decor, camera_over, rgba, thinned
+from sidestep.plants.library import load_mujoco, make_renderer
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER, TARGET
 from sidestep.views.video_files import write_video_file
 

@@ -1,13 +1,13 @@
 """How would it go on robots? The scenario in a physics simulator: motors, wheels, noise and delay."""
 
-from sidestep.plants.ground.contacts import Contacts, Watch
+from sidestep.plants.contacts import Contacts, Watch
 from sidestep.plants.ground.episode import TwinEpisode, run_twin, settings_for, twin_episode
-from sidestep.plants.ground.library import TwinError
 from sidestep.plants.ground.options import PURSUER_SEES, TwinOptions, bounded_errors
 from sidestep.plants.ground.robots import BASES
-from sidestep.plants.ground.sensors import SENSORS, Measurement, Sensors, changed_sensors, make_sensors
 from sidestep.plants.ground.twin import Twin
 from sidestep.plants.ground.video import frames_of, write_video
+from sidestep.plants.library import TwinError
+from sidestep.plants.sensors import SENSORS, Measurement, Sensors, changed_sensors, make_sensors
 
 __all__ = [
     "BASES",

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from sidestep import _interrupts
 from sidestep._arrays import seed_number
 from sidestep.plants.ground.options import TwinOptions
-from sidestep.plants.ground.record import (
+from sidestep.plants.ground.twin import Twin
+from sidestep.plants.record import (
     Log,
     PhysicsEpisode,
     estimate_error,
@@ -22,7 +23,6 @@ from sidestep.plants.ground.record import (
     start_of,
     steered,
 )
-from sidestep.plants.ground.twin import Twin
 from sidestep.pursuit import as_pursuer
 from sidestep.robot import Onboard, OnboardSettings
 from sidestep.safety import Budget, Shield

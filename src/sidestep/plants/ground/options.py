@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sidestep.plants.ground.library import TwinError
 from sidestep.plants.ground.robots import BASES
-from sidestep.plants.ground.sensors import SENSORS, Sensors
+from sidestep.plants.library import TwinError
+from sidestep.plants.sensors import SENSORS, Sensors
 from sidestep.world import Scenario
 
 PURSUER_SEES = ("truth", "measurements")

@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from sidestep.plants.drawing import mjcf_colour, studio
+
 BASES = ("servo", "omniwheels")
 """Kinds of evader: `servo` planar joints with velocity servos; `omniwheels` three wheels with rollers."""
 
@@ -30,12 +32,6 @@ _ROLLER_RADIUS = 0.008
 _CHASSIS_MASS, _WHEEL_MASS, _CASTER_RADIUS = 3.0, 0.15, 0.015
 _MOTOR_ARMATURE = 0.001
 _PURSUER_ACCELERATION = 4.0
-
-
-def mjcf_colour(colour: str, alpha: float = 1.0) -> str:
-    """A colour `#rrggbb` as MJCF wants it."""
-    channels = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-    return " ".join(f"{channel:.4f}" for channel in (*channels, alpha))
 
 
 def pursuer_body(index: int, half_axle: float, colour: str) -> str:
@@ -178,25 +174,6 @@ def obstacle_motors(index: int) -> str:
     <velocity name="obstacle{index}_{axis}" joint="obstacle{index}_{axis}" kv="100"/>"""
         for axis in "xy"
     )
-
-
-def studio(*, shadows: int, view: str, tiles: int) -> str:
-    """Light, sky and the material of a tiled floor as MJCF: `shadows` across in pixels, attributes of how it
-    is `view`ed, `tiles` to a metre."""
-    return f"""\
-  <visual>
-    <global offwidth="1920" offheight="1200"/>
-    <quality shadowsize="{shadows}" offsamples="4"/>
-    <map {view}/>
-    <headlight ambient="0.4 0.4 0.4" diffuse="0.2 0.2 0.2" specular="0 0 0"/>
-  </visual>
-  <asset>
-    <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" width="16" height="16"/>
-    <texture name="tiles" type="2d" builtin="flat" mark="edge" rgb1="0.9 0.9 0.89" markrgb="0.7 0.7 0.69"
-             width="128" height="128"/>
-    <material name="floor" texture="tiles" texrepeat="{tiles} {tiles}" texuniform="true" reflectance="0"
-              specular="0"/>
-  </asset>"""
 
 
 def scene_xml(

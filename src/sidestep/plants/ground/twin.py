@@ -8,12 +8,12 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
+from sidestep.plants.contacts import Contacts, Watch
 from sidestep.plants.ground.actuation import DelayLine, omniwheel_speeds, yaw_rate
-from sidestep.plants.ground.contacts import Contacts, Watch
-from sidestep.plants.ground.library import TwinError, check_robots, load_mujoco
 from sidestep.plants.ground.options import TwinOptions
 from sidestep.plants.ground.robots import WHEEL_RADIUS, scene_xml
-from sidestep.plants.ground.sensors import Measurement, PoseSensors
+from sidestep.plants.library import TwinError, check_robots, load_mujoco
+from sidestep.plants.sensors import Measurement, PoseSensors
 from sidestep.world import Scenario, World
 
 _SETTLE = 0.3

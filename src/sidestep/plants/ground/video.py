@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from sidestep.plants.ground.drawing import Decor, camera_over, rgba, thinned
+from sidestep.plants.drawing import Decor, camera_over, rgba, thinned
 from sidestep.plants.ground.episode import TwinEpisode
-from sidestep.plants.ground.library import load_av, load_mujoco, make_renderer
 from sidestep.plants.ground.twin import Twin
+from sidestep.plants.library import load_av, load_mujoco, make_renderer
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER, TARGET
 from sidestep.views.video_files import write_video_file
 

@@ -19,6 +19,31 @@ def rgba(colour: str, alpha: float = 1.0) -> Float[np.ndarray, "4"]:
     return np.array([*(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)), alpha], np.float32)
 
 
+def mjcf_colour(colour: str, alpha: float = 1.0) -> str:
+    """A colour `#rrggbb` as MJCF wants it."""
+    channels = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
+    return " ".join(f"{channel:.4f}" for channel in (*channels, alpha))
+
+
+def studio(*, shadows: int, view: str, tiles: int) -> str:
+    """Light, sky and the material of a tiled floor as MJCF: `shadows` across in pixels, attributes of how it
+    is `view`ed, `tiles` to a metre."""
+    return f"""\
+  <visual>
+    <global offwidth="1920" offheight="1200"/>
+    <quality shadowsize="{shadows}" offsamples="4"/>
+    <map {view}/>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.2 0.2 0.2" specular="0 0 0"/>
+  </visual>
+  <asset>
+    <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" width="16" height="16"/>
+    <texture name="tiles" type="2d" builtin="flat" mark="edge" rgb1="0.9 0.9 0.89" markrgb="0.7 0.7 0.69"
+             width="128" height="128"/>
+    <material name="floor" texture="tiles" texrepeat="{tiles} {tiles}" texuniform="true" reflectance="0"
+              specular="0"/>
+  </asset>"""
+
+
 @final
 class Decor:
     """Draws what is not a body: distances, paths, the target."""

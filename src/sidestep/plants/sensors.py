@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.plants.ground.library import TwinError
+from sidestep.plants.library import TwinError
 
 _CUT = 3.0
 """Noise is cut at this many standard deviations, so that every error has a bound."""

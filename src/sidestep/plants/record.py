@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sidestep._arrays import whole_number
 from sidestep.loop import Trajectory
 from sidestep.loop.keys import start_and_pursuit
-from sidestep.plants.ground.contacts import Contacts
+from sidestep.plants.contacts import Contacts
 from sidestep.pursuit import Pursuer, pursue
 from sidestep.robot import Decision
 from sidestep.safety import Status
