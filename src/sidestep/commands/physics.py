@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from sidestep.commands.fly import Fly
     from sidestep.commands.twin import Twin
-    from sidestep.plants.record import PhysicsEpisode
+    from sidestep.plants import PlantEpisode
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def play_seeds(
     command: Twin | Fly,
     robots: str,
     prepare: Callable[[], Any],
-    play: Callable[[Any, int], PhysicsEpisode],
+    play: Callable[[Any, int], PlantEpisode],
     console: Console,
 ) -> Played:
     """`play(player, seed)` for all the command's seeds, with the player that `prepare()` makes.
@@ -132,7 +132,7 @@ def draw_beside_simulation(
     command: Twin | Fly,
     policy: Any,
     shield: Any,
-    episode: PhysicsEpisode,
+    episode: PlantEpisode,
     stem: Path,
     about: dict[str, Any],
     console: Console,

@@ -1,37 +1,36 @@
-"""What is kept of an episode in which physics moves the robots?"""
+"""What is kept of an episode on a plant?"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float
 
-from sidestep._arrays import whole_number
 from sidestep.loop import Trajectory
-from sidestep.loop.keys import start_and_pursuit
 from sidestep.plants.contacts import Contacts
-from sidestep.pursuit import Pursuer, pursue
+from sidestep.plants.plant import Plant
 from sidestep.robot import Decision
 from sidestep.safety import Status
+from sidestep.store.runs import OUTCOMES
 from sidestep.world import Events, Scenario, World
 
 
 @dataclass(frozen=True)
-class PhysicsEpisode:
+class PlantEpisode:
     """One episode of T control periods.
 
     - `trajectory` its truth as a `Trajectory`: worlds at the beginning of each period, the decisions, and
-      events from the least distances at every physics step
+      events from the least distances at every instant
     - `least_pursuer_distance`, `least_obstacle_distance` (m) over the episode, infinite without such a robot
     - `levels` per period, and `reactions` as pairs of a time (s) and what the decision core said it did
     - `estimate_errors (T,)` m, the largest error of a robot's estimated place as seen from the evader;
-      `tracking_errors (T,)`, how far the evader was from what it was told
+      `tracking_errors (T,)`, the plant's `tracking_error` at the end of each period
     - `compute_seconds (T,)` what each decision took
+    - `frames` of the plant, for `write_video`, and `frame_times` s
     """
 
     scenario: Scenario
@@ -44,6 +43,8 @@ class PhysicsEpisode:
     estimate_errors: Float[np.ndarray, "t"]
     tracking_errors: Float[np.ndarray, "t"]
     compute_seconds: Float[np.ndarray, "t"]
+    frames: Any
+    frame_times: Float[np.ndarray, "n"]
 
     @property
     def outcome(self) -> str:
@@ -80,24 +81,6 @@ def _finite(distance: float) -> float | None:
     return distance if np.isfinite(distance) else None
 
 
-def periods_of(scenario: Scenario, steps: int | None) -> int:
-    """How many control periods to play at most. **Raises** `ValueError` for fewer than one."""
-    return scenario.episode_steps if steps is None else whole_number("steps", steps)
-
-
-@eqx.filter_jit
-def start_of(scenario: Scenario, seed: Array) -> tuple[World, PRNGKeyArray]:
-    """The start that `rollout` has with this seed, and the key of its pursuers."""
-    start_key, pursuit_key = start_and_pursuit(jax.random.key(seed))
-    return scenario.reset(start_key), pursuit_key
-
-
-@eqx.filter_jit
-def steered(scenario: Scenario, pursuer: Pursuer, world: World, key: PRNGKeyArray, period: Array) -> Array:
-    """What every pursuer does in a period, (m, 2) m/s."""
-    return pursue(scenario, pursuer, world, jax.random.fold_in(key, period))
-
-
 def events_of(scenario: Scenario, world: World, contacts: Contacts, last: bool) -> dict[str, Any]:
     """What a period brought, in the terms of the plain simulation."""
     distance = float(np.hypot(*(np.asarray(world.evader) - np.asarray(world.target))))
@@ -129,27 +112,24 @@ def estimate_error(decision: Decision, truth: World) -> float:
 
 @final
 class Log:
-    """What is written down period by period."""
+    """Writes an episode down, period by period; `world` is the truth at the end of the last."""
 
-    def __init__(self, start: World):
-        self._worlds, self._entries, self._events = [start], [], []
+    def __init__(self, plant: Plant):
+        self._plant, self.world = plant, plant.world
+        self._worlds, self._entries, self._events = [self.world], [], []
         self._levels: list[str] = []
         self._reactions: list[tuple[float, str]] = []
-        self._numbers: list[tuple[float, float, float]] = []
+        self._numbers: list[tuple[float, ...]] = []
 
     def add(
-        self,
-        now: float,
-        decision: Decision,
-        wheels: Float[np.ndarray, "m 2"],
-        after: World,
-        events: dict[str, Any],
-        estimate_error: float,
-        tracking_error: float,
-    ) -> None:
-        """One period, begun at `now` (s); `after` is the truth at its end."""
-        self._worlds.append(after)
-        self._events.append(events)
+        self, now: float, decision: Decision, wheels: Float[np.ndarray, "m 2"], contacts: Contacts
+    ) -> bool:
+        """Write down one period, begun at `now` (s); returns whether the episode ended in it."""
+        plant, before = self._plant, self.world
+        self.world = plant.world
+        self._worlds.append(self.world)
+        last = len(self._worlds) > plant.scenario.episode_steps
+        self._events.append(events_of(plant.scenario, self.world, contacts, last))
         self._entries.append(
             {
                 "nominal": np.asarray(decision.nominal, np.float32),
@@ -163,21 +143,30 @@ class Log:
         )
         self._levels.append(decision.level)
         self._reactions += [(now, text) for text in decision.reactions]
-        self._numbers.append((estimate_error, tracking_error, float(decision.compute_seconds)))
+        distances = (contacts.pursuer_distance, contacts.obstacle_distance)
+        error = estimate_error(decision, before)
+        self._numbers.append((*distances, error, plant.tracking_error, float(decision.compute_seconds)))
+        return any(self._events[-1][name] for name in OUTCOMES)
 
-    def kept(self) -> dict[str, Any]:
-        """What a `PhysicsEpisode` has of it, by name."""
+    def episode(self, seed: int) -> PlantEpisode:
+        """All that was written down."""
         stacked = lambda trees: jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)  # noqa: E731
         # On the host first, or JAX would compile a stack of every new length.
         worlds = stacked([jax.tree.map(np.asarray, world) for world in self._worlds])
-        numbers = np.array(self._numbers)
-        return {
-            "trajectory": Trajectory(
+        pursuer, obstacle, estimates, tracking, seconds = np.array(self._numbers).T
+        return PlantEpisode(
+            scenario=self._plant.scenario,
+            seed=seed,
+            trajectory=Trajectory(
                 worlds=worlds, events=Events(**stacked(self._events)), **stacked(self._entries)
             ),
-            "levels": tuple(self._levels),
-            "reactions": tuple(self._reactions),
-            "estimate_errors": numbers[:, 0],
-            "tracking_errors": numbers[:, 1],
-            "compute_seconds": numbers[:, 2],
-        }
+            least_pursuer_distance=float(np.min(pursuer)),
+            least_obstacle_distance=float(np.min(obstacle)),
+            levels=tuple(self._levels),
+            reactions=tuple(self._reactions),
+            estimate_errors=estimates,
+            tracking_errors=tracking,
+            compute_seconds=seconds,
+            frames=self._plant.frames,
+            frame_times=np.array(self._plant.frame_times),
+        )

@@ -7,51 +7,38 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from sidestep import _interrupts
-from sidestep._arrays import seed_number
 from sidestep.learning import load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.step import decide, decision_steps_of
 from sidestep.plants.air.flight import Flight
 from sidestep.plants.air.options import FlightOptions, budget_of, check_scenario, errors_of
-from sidestep.plants.record import (
-    Log,
-    PhysicsEpisode,
-    estimate_error,
-    events_of,
-    periods_of,
-    start_of,
-    steered,
-)
-from sidestep.pursuit import as_pursuer
-from sidestep.robot import Onboard, OnboardSettings
+from sidestep.plants.play import Robot, play, see
+from sidestep.plants.record import PlantEpisode
+from sidestep.robot import Decision, Onboard, OnboardSettings
 from sidestep.safety import AdaptedShield, Certificate, Shield, as_shield, certify, make_shield
 from sidestep.safety.certificate.certificate import start_margin
 from sidestep.safety.shields.catalogue import BUDGETED
-from sidestep.store.runs import OUTCOMES
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
 
 
 @dataclass(frozen=True)
-class FlightEpisode(PhysicsEpisode):
+class FlightEpisode(PlantEpisode):
     """One flight; `tracking_errors` are in m, how far the quadrotor was at most from the motion asked of it.
 
     - `start_margin` m: how far outside the certificate's start set the flight began; None without a
       certificate
     - `saturated` s, for how long tilt or rotors were at their limits
-    - `frames` (positions, and places and quaternions of the other bodies) and `frame_times` at 100 Hz
+    - `frames` at 100 Hz: positions, and places and quaternions of the other bodies
     """
 
     options: FlightOptions
     start_margin: float | None
     saturated: float
-    frames: list[Any]
-    frame_times: Float[np.ndarray, "n"]
 
     @property
     def within_assumptions(self) -> bool:
@@ -63,8 +50,12 @@ class FlightEpisode(PhysicsEpisode):
             and all(level == "normal" for level in self.levels)
         )
 
+    def plant(self) -> Flight:
+        """The flight that it was, built anew."""
+        return Flight(self.scenario, self.options, self.seed)
+
     def to_dict(self) -> dict[str, Any]:
-        """As that of `PhysicsEpisode`, and what the certificate assumes."""
+        """As that of `PlantEpisode`, and what the certificate assumes."""
         return super().to_dict() | {
             "tracking_error_max": float(np.max(self.tracking_errors)),
             "within_assumptions": self.within_assumptions,
@@ -74,7 +65,7 @@ class FlightEpisode(PhysicsEpisode):
 
 
 @final
-class Pilot:
+class Pilot(Robot):
     """Decides for the quadrotor: a policy's wish, through a shield that guards its control point.
 
     The shield knows the quadrotor by the motion that its autopilot is asked for, and everybody else by
@@ -120,19 +111,16 @@ class Pilot:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the flight before."""
         self.onboard.reset()
         self._count, self._wish = 0, np.zeros(2)
 
-    def decide(self, flight: Flight) -> Any:
-        """The decision for the period that begins now, from what has been measured by now."""
-        now = flight.time
-        for robot, index, stamp, pose in flight.measurements():
-            self.onboard.see(robot, stamp, pose if robot != "obstacle" else pose[:2], index)
-        self.onboard.see("evader", now, (*flight.control_point, 0.0), now=now)
+    def decide(self, plant: Flight) -> Decision:
+        now = plant.time
+        see(self.onboard, plant)
+        self.onboard.see("evader", now, (*plant.control_point, 0.0), now=now)
         seen = self.onboard.world(now)
         if seen is not None and self._count % self._every == 0:
-            self._wish = np.asarray(self._decide(self._known(flight, seen)), float)
+            self._wish = np.asarray(self._decide(self._known(plant, seen)), float)
         self._count += 1
         self.onboard.nominal(now, self._wish)
         return self.onboard.decide(now)
@@ -171,56 +159,19 @@ def fly(
     world: World | None = None,
     certificate: Certificate | None = None,
 ) -> FlightEpisode:
-    """One flight: measurements, the pilot's command and the pursuers', physics, once per period.
+    """One flight, see `sidestep.plants.play`.
 
-    Start, measurements and random pursuers follow from `seed`; the start is that of `rollout` with this seed.
+    **Arguments:** `pilot`, which is reset; `certificate` as `certificate_of` gives it, to say whether the
+    flight began where it holds; the rest as for `play`.
 
-    **Arguments:** `pilot`, which is reset; `pursuer` as for `evaluate`; `steps` at most this many control
-    periods (the scenario's `episode_steps` if not given); `world` to start in; `certificate` as
-    `certificate_of` gives it, to say whether the flight began where it holds.
-
-    **Raises** `ValueError` as `evaluate`, and `TwinError` when MuJoCo is missing or the flight goes out of
-    control.
+    **Raises** as `play`, and `TwinError` when MuJoCo is missing or the flight goes out of control.
     """
-    scenario, options = pilot.scenario, pilot.options
-    limit = periods_of(scenario, steps)
-    strategy = as_pursuer(pursuer)
-    seed_number(seed)
-    flight = Flight(scenario, options, seed)
-    drawn, key = start_of(scenario, jnp.asarray(seed, jnp.uint32))
-    flight.reset(drawn if world is None else world)
-    pilot.reset()
-    truth = flight.world
-    margin = None if certificate is None else _margin(certificate, truth)
-    period = float(scenario.control_period)
-    log = Log(truth)
-    for count in range(limit):
-        _interrupts.check()
-        now = flight.time
-        decision = pilot.decide(flight)
-        estimate = pilot.onboard.world(now) if options.pursuer_sees == "measurements" else None
-        seen = truth if estimate is None else estimate
-        wheels = np.asarray(steered(scenario, strategy, seen, key, jnp.asarray(count, jnp.uint32)))
-        flight.command(decision.velocity, wheels)
-        contacts = flight.advance((count + 1) * period - now)
-        before, truth = truth, flight.world
-        events = events_of(scenario, truth, contacts, count + 1 >= scenario.episode_steps)
-        log.add(now, decision, wheels, truth, events, estimate_error(decision, before), flight.tracking_error)
-        if any(events[name] for name in OUTCOMES):
-            break
-    pursuer_distance, obstacle_distance = flight.least_distances
-    return FlightEpisode(
-        scenario=scenario,
-        seed=seed,
-        least_pursuer_distance=pursuer_distance,
-        least_obstacle_distance=obstacle_distance,
-        **log.kept(),
-        options=options,
-        start_margin=margin,
-        saturated=flight.saturated,
-        frames=flight.frames,
-        frame_times=np.array(flight.frame_times),
-    )
+    options = pilot.options
+    flight = Flight(pilot.scenario, options, seed)
+    played = play(flight, pilot, pursuer, seed, steps, world=world, pursuer_sees=options.pursuer_sees)
+    start = jax.tree.map(lambda leaf: leaf[0], played.trajectory.worlds)
+    margin = None if certificate is None else _margin(certificate, start)
+    return FlightEpisode(**vars(played), options=options, start_margin=margin, saturated=flight.saturated)
 
 
 def _margin(certificate: Certificate, world: World) -> float:

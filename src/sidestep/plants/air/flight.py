@@ -12,15 +12,16 @@ from sidestep.plants.air.airframe import ROTORS, scene_xml
 from sidestep.plants.air.autopilot import Attitude, Autopilot, Setpoint
 from sidestep.plants.air.estimate import OwnMotion
 from sidestep.plants.air.options import FlightOptions, check_scenario
-from sidestep.plants.contacts import Contacts, Watch
-from sidestep.plants.library import TwinError, check_robots, load_mujoco
-from sidestep.plants.sensors import Measurement, PoseSensors
+from sidestep.plants.bodies import Bodies, Look
+from sidestep.plants.contacts import Contacts
+from sidestep.plants.library import TwinError
+from sidestep.plants.sensors import Measurement
 from sidestep.views.style import EVADER, OBSTACLE, PURSUER
 from sidestep.world import Scenario, World
 from sidestep.world.flyers import GRAVITY, Quadrotor
 from sidestep.world.robots import body_velocity
 
-_FRAME_RATE = 100.0
+_TRAIL, _TILT, _NEAR = 0.006, math.radians(-42.0), 2.0
 _COLUMN = 0.6
 """Radius of a column, as a share of the collision distance; the quadrotor needs the rest."""
 
@@ -57,79 +58,65 @@ class _Aircraft:
 
 
 @final
-class Flight:
+class Flight(Bodies):
     """The scenario's quadrotor in MuJoCo, flown by its autopilot, with an aircraft and columns.
 
-    As `plants.ground.Twin`: `reset`, then `command`, `advance` and `measurements`. What the shield is
-    told of the quadrotor is `reference`: the motion that the velocities told make of `Quadrotor`, which the
-    autopilot flies after. How far it is from that is `tracking_error`.
+    What the shield is told of the quadrotor is `reference`: the motion that the commanded velocities make of
+    `Quadrotor`, which the autopilot follows. `tracking_error` (m) is how far the quadrotor has been from it
+    at most. It holds its heading and ignores turn rates; `measurements` are of the others only.
 
-    **Attributes:** `model` and `data` of MuJoCo; `frames` at 100 Hz (`positions (n, nq)`, and poses of the
-    mocap bodies) and `frame_times (n,)` in s, to be drawn.
+    **Attributes:** as those of `Bodies`; each frame holds MuJoCo's positions `(nq,)`, and positions and
+    quaternions of the mocap bodies. `saturated` s, for how long tilt or rotors were at their limits.
 
     **Raises** `TwinError` when MuJoCo is missing, or for a scenario without a quadrotor.
     """
 
+    options: FlightOptions
+
     def __init__(self, scenario: Scenario, options: FlightOptions | None = None, seed: int = 0):
-        self.scenario, self.options = scenario, options or FlightOptions()
-        check_scenario(scenario, self.options)
-        self._mujoco = mujoco = load_mujoco()
-        self._seed = seed
-        self.counts = (scenario.pursuer_count, scenario.obstacle_count)
+        options, counts = options or FlightOptions(), (scenario.pursuer_count, scenario.obstacle_count)
+        check_scenario(scenario, options)
         xml = scene_xml(
-            self.options.airframe,
-            *self.counts,
-            physics_step=self.options.physics_step,
+            options.airframe,
+            *counts,
+            physics_step=options.physics_step,
             column_radius=_COLUMN * float(scenario.collision_distance),
-            column_height=2.0 * self.options.height,
+            column_height=2.0 * options.height,
             colours=(EVADER, PURSUER, OBSTACLE),
         )
-        self.model: Any = mujoco.MjModel.from_xml_string(xml)
-        self.data: Any = mujoco.MjData(self.model)
-        find = mujoco.mj_name2id
-        self._body = find(self.model, mujoco.mjtObj.mjOBJ_BODY, "quadrotor")
-        self._motors = [find(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in ROTORS]
-        names = [f"pursuer{i}" for i in range(self.counts[0])] + [
-            f"obstacle{i}" for i in range(self.counts[1])
+        super().__init__(scenario, options, seed, xml)
+        height = options.height
+        self.look = Look(height, height, (height, _TRAIL), 1.5 * height, _TILT, _NEAR)
+        find, kinds = self._mujoco.mj_name2id, self._mujoco.mjtObj
+        self._body = find(self.model, kinds.mjOBJ_BODY, "quadrotor")
+        self._motors = [find(self.model, kinds.mjOBJ_ACTUATOR, name) for name in ROTORS]
+        names = [
+            f"{kind}{i}" for kind, n in zip(("pursuer", "obstacle"), counts, strict=True) for i in range(n)
         ]
-        bodies = [find(self.model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
+        bodies = [find(self.model, kinds.mjOBJ_BODY, name) for name in names]
         self._mocap = [int(self.model.body_mocapid[body]) for body in bodies]
-        self._ticks = round(self.options.autopilot_period / self.options.physics_step)
+        self._ticks = round(options.autopilot_period / options.physics_step)
         model = scenario.evader_model
         assert isinstance(model, Quadrotor)
-        self._transition = _transition(model, self.options.autopilot_period)
+        self._transition = _transition(model, options.autopilot_period)
         self._lags = float(model.time_constant), float(model.attitude_lag)
-        self._autopilot = Autopilot(self.options.airframe, self.options.gains)
-        self._speed = float(scenario.evader_speed)
+        self._autopilot = Autopilot(options.airframe, options.gains)
 
-    def reset(self, world: World, seed: int | None = None) -> None:
-        """Everything where `world` has it: the quadrotor hovers, the aircraft flies straight on, at time 0.
-
-        **Raises** `TwinError` for a world with other numbers of robots than the scenario's.
-        """
-        counts = self.counts
-        check_robots(world, *counts)
-        self._seed = self._seed if seed is None else seed
-        options, data = self.options, self.data
-        self._target, self._steps = np.asarray(world.target, float), 0
-        self._mujoco.mj_resetData(self.model, data)
+    def _begin(self, world: World, root: np.random.Generator) -> None:
+        """The quadrotor hovers, the aircraft flies straight on."""
+        options, data, pursuers = self.options, self.data, self.counts[0]
         place = np.array([*np.asarray(world.evader, float), options.height])
         data.qpos[:3], data.qpos[3:7] = place, (1.0, 0.0, 0.0, 0.0)
         hover = options.airframe.mass * GRAVITY / 4.0
         data.act[:], data.ctrl[self._motors] = hover, hover
         self._plan = np.zeros((4, 2))
         self._plan[0] = place[:2]
-        slowest = float(self._drivable(np.zeros((counts[0], 2)))[0, 0]) if counts[0] else 0.0
+        slowest = float(self._drivable(np.zeros((pursuers, 2)))[0, 0]) if pursuers else 0.0
         self._aircraft = [_Aircraft(pose, slowest) for pose in np.asarray(world.pursuers, float)]
         self._columns = np.asarray(world.obstacles, float).copy()
         self._autopilot.reset()
-        self._contacts = Watch(self.scenario, self._target)
-        self.frames: list[Any] = []
-        self.frame_times: list[float] = []
         self.tracking_error = 0.0
         self.saturated = 0.0
-        root = np.random.default_rng(self._seed)
-        self._sensors = PoseSensors(options.sensors, counts, options.physics_step, root)
         (self._noise,) = root.spawn(1)
         self._own = OwnMotion(
             options.acceleration_noise, options.sensors.position_noise, 1.0 / options.sensors.rate
@@ -152,16 +139,6 @@ class Flight:
         self._sensors.evaders(0.0)
 
     @property
-    def time(self) -> float:
-        """Seconds since the reset."""
-        return self._steps * self.options.physics_step
-
-    @property
-    def least_distances(self) -> tuple[float, float]:
-        """Least true distances (m) to a pursuer and to an obstacle since the reset; infinite without one."""
-        return self._contacts.least
-
-    @property
     def reference(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
         """Position (m), velocity (m/s) and acceleration (m/s^2) that the autopilot is asked for now."""
         return self._plan[0].copy(), self._plan[1].copy(), self._plan[2].copy()
@@ -172,13 +149,10 @@ class Flight:
         tau, lag = self._lags
         return self._plan[0] + tau * (self._plan[1] + lag * self._plan[2])
 
-    def command(self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"]) -> None:
-        """What the quadrotor (m/s, world axes) and the pursuers (as strategies answer) are told from now on,
-        cut to their limits; numbers that are not finite count as a stop."""
-        wanted = np.asarray(velocity, float)
-        wanted = wanted if np.all(np.isfinite(wanted)) else np.zeros(2)
-        speed = math.hypot(*wanted)
-        self._plan[3] = wanted * (self._speed / speed) if speed > self._speed else wanted
+    def command(
+        self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"], turn_rate: float = 0.0
+    ) -> None:
+        self._plan[3] = self._limited(velocity)
         if len(self._aircraft):
             for aircraft, told in zip(self._aircraft, self._drivable(wheel_speeds), strict=True):
                 aircraft.told = told
@@ -192,17 +166,14 @@ class Flight:
         )
 
     def advance(self, duration: float) -> Contacts:
-        """Let `duration` (s) pass, in whole physics steps, and say how near the evader came to what."""
+        """Let `duration` (s) pass, in whole physics steps; returns how near the evader came to what."""
         options, data, step = self.options, self.data, self.options.physics_step
-        count = round((self.time + duration) / step) - self._steps
-        every = max(round(1.0 / (_FRAME_RATE * step)), 1)
+        count = self._steps_in(duration)
         share = -math.expm1(-step / options.pursuer_lag)
         poses = np.empty((count, 1 + len(self._mocap), 3))
         wind = np.array([*options.wind, 0.0])
         for index in range(count):
-            if self._steps % every == 0:
-                self.frames.append((data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()))
-                self.frame_times.append(self.time)
+            self._record()
             if self._steps % self._ticks == 0:
                 self._fly()
             data.xfrc_applied[self._body, :3] = options.airframe.drag * (wind - data.qvel[:3])
@@ -221,7 +192,7 @@ class Flight:
                 f"the quadrotor lost its height at {self.time:.3f} s: its gains, or its rotors, do not do "
                 "for what it is told"
             )
-        return self._contacts.see(poses)
+        return self._watch.see(poses)
 
     def _fly(self) -> None:
         """One period of the autopilot."""
@@ -276,13 +247,20 @@ class Flight:
         places = [[*self.data.qpos[:2], heading], *(craft.pose for craft in self._aircraft), *columns]
         return np.array(places, float)
 
+    def _frame(self) -> tuple[np.ndarray, ...]:
+        return (self.data.qpos.copy(), self.data.mocap_pos.copy(), self.data.mocap_quat.copy())
+
+    def show(self, frame: tuple[np.ndarray, ...]) -> None:
+        self.data.qpos[:], self.data.mocap_pos[:], self.data.mocap_quat[:] = frame
+
+    def places_of(self, frames: Any) -> Float[np.ndarray, "n robots 2"]:
+        return np.array([[own[:2], *others[:, :2]] for own, others, _ in frames])
+
     def measurements(self) -> list[Measurement]:
-        """Poses of the others that have arrived by now and were not handed out before, oldest first."""
         return self._sensors.others(self.time)
 
     @property
     def world(self) -> World:
-        """The truth now."""
         axle = float(self.scenario.pursuer_half_axle)
         motions = np.array([craft.motion for craft in self._aircraft], float).reshape(-1, 2)
         speed, turn = motions[:, :1], axle * motions[:, 1:]

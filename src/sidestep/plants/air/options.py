@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from sidestep.plants.air.airframe import Airframe
 from sidestep.plants.air.autopilot import Gains
-from sidestep.plants.ground import PURSUER_SEES
 from sidestep.plants.library import TwinError
+from sidestep.plants.options import check_options
 from sidestep.plants.sensors import Sensors
 from sidestep.safety import Budget
 from sidestep.world import Scenario
@@ -48,22 +48,10 @@ class FlightOptions:
     autopilot_period: float = 0.002
 
     def __post_init__(self):
-        if self.pursuer_sees not in PURSUER_SEES:
-            raise TwinError(
-                f"pursuer_sees = {self.pursuer_sees!r}: it must be one of {', '.join(PURSUER_SEES)}"
-            )
-        for name in ("tracking_error", "acceleration_noise", "tilt_bias"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise TwinError(f"{name} = {value!r}: it must be finite, 0 or more")
-        for name in ("pursuer_lag", "height"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise TwinError(f"{name} = {value!r}: it must be finite and greater than 0")
+        not_negative = ("tracking_error", "acceleration_noise", "tilt_bias")
+        check_options(self, not_negative=not_negative, positive=("pursuer_lag", "height"))
         if len(self.wind) != 2 or not all(math.isfinite(part) for part in self.wind):
             raise TwinError(f"wind = {self.wind!r}: it must be two finite numbers, m/s")
-        if not 0.0 < self.physics_step <= 0.002:
-            raise TwinError(f"physics_step = {self.physics_step!r}: it must be at most 0.002 s")
         ticks = self.autopilot_period / self.physics_step
         if not (0.0 < self.autopilot_period <= 0.01 and abs(ticks - round(ticks)) < 1e-6 and ticks > 0.5):
             raise TwinError(

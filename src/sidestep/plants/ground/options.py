@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from sidestep.plants.ground.robots import BASES
 from sidestep.plants.library import TwinError
+from sidestep.plants.options import check_options
 from sidestep.plants.sensors import SENSORS, Sensors
 from sidestep.world import Scenario
-
-PURSUER_SEES = ("truth", "measurements")
-"""What the pursuer decides from: where everything truly is, or what the evader measures too."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +34,8 @@ class TwinOptions:
     def __post_init__(self):
         if self.base not in BASES:
             raise TwinError(f"base = {self.base!r}: it must be one of {', '.join(BASES)}")
-        if self.pursuer_sees not in PURSUER_SEES:
-            raise TwinError(
-                f"pursuer_sees = {self.pursuer_sees!r}: it must be one of {', '.join(PURSUER_SEES)}"
-            )
-        if not (math.isfinite(self.actuation_delay) and self.actuation_delay >= 0.0):
-            raise TwinError(f"actuation_delay = {self.actuation_delay!r}: it must be finite, 0 or more")
-        for name in ("acceleration", "lag", "pursuer_lag"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise TwinError(f"{name} = {value!r}: it must be finite and greater than 0")
-        if not 0.0 < self.physics_step <= 0.002:
-            raise TwinError(
-                f"physics_step = {self.physics_step!r}: it must be at most 0.002 s, for stability"
-            )
+        positive = ("acceleration", "lag", "pursuer_lag")
+        check_options(self, not_negative=("actuation_delay",), positive=positive)
 
 
 def bounded_errors(scenario: Scenario, options: TwinOptions) -> dict[str, float]:

@@ -8,18 +8,17 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.plants.contacts import Contacts, Watch
+from sidestep.plants.bodies import Bodies, Look
+from sidestep.plants.contacts import Contacts
 from sidestep.plants.ground.actuation import DelayLine, omniwheel_speeds, yaw_rate
 from sidestep.plants.ground.options import TwinOptions
 from sidestep.plants.ground.robots import WHEEL_RADIUS, scene_xml
-from sidestep.plants.library import TwinError, check_robots, load_mujoco
-from sidestep.plants.sensors import Measurement, PoseSensors
+from sidestep.plants.library import TwinError
+from sidestep.plants.sensors import Measurement
 from sidestep.world import Scenario, World
 
 _SETTLE = 0.3
 _COLOURS = ("#0072B2", "#D55E00", "#595959")
-_FRAME_RATE = 100.0
-_LIMITS = ("evader_speed", "pursuer_speed")
 
 
 class _Places:
@@ -60,52 +59,39 @@ def _heading(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n"]:
 
 
 @final
-class Twin:
+class Twin(Bodies):
     """The scenario's robots as bodies with motors, wheels and friction, in MuJoCo.
 
-    `reset` it to a world; then `command`, `advance` and read `measurements`, in the rhythm of whoever
-    decides. The same seed and the same commands give the same motion and the same measurements.
+    `tracking_error` is how far the evader's mean velocity since its last command is from that, m/s. The
+    evader holds its heading and ignores turn rates.
 
-    **Attributes:** `model` and `data` of MuJoCo; `frames` the positions (n, nq) at 100 Hz since the reset
-    and `frame_times (n,)` in s, to be drawn.
+    **Attributes:** as those of `Bodies`; each frame holds MuJoCo's positions `(nq,)`.
 
     **Raises** `TwinError` when MuJoCo is missing, `ValueError` for robots of one's own.
     """
 
+    options: TwinOptions
+    look = Look()
+
     def __init__(self, scenario: Scenario, options: TwinOptions | None = None, seed: int = 0):
         scenario.check_built_in("the twin", "`sidestep fly` flies a quadrotor, sidestep.plants.air")
-        self._mujoco = mujoco = load_mujoco()
-        self.scenario, self.options = scenario, options or TwinOptions()
-        self._seed = seed
-        pursuers, obstacles = scenario.pursuer_count, scenario.obstacle_count
+        options, counts = options or TwinOptions(), (scenario.pursuer_count, scenario.obstacle_count)
         xml = scene_xml(
-            self.options.base,
+            options.base,
             float(scenario.pursuer_half_axle),
-            pursuers,
-            obstacles,
-            physics_step=self.options.physics_step,
-            lag=self.options.lag,
-            pursuer_lag=self.options.pursuer_lag,
-            acceleration=self.options.acceleration,
+            *counts,
+            physics_step=options.physics_step,
+            lag=options.lag,
+            pursuer_lag=options.pursuer_lag,
+            acceleration=options.acceleration,
             colours=_COLOURS,
         )
-        self.model: Any = mujoco.MjModel.from_xml_string(xml)
-        self.data: Any = mujoco.MjData(self.model)
-        self._places = _Places(mujoco, self.model, self.options.base, pursuers, obstacles)
-        self._limits = {name: float(getattr(scenario, name)) for name in _LIMITS}
+        super().__init__(scenario, options, seed, xml)
+        self._places = _Places(self._mujoco, self.model, options.base, *counts)
+        self._top = float(scenario.pursuer_speed)
 
-    def reset(self, world: World, seed: int | None = None) -> None:
-        """Everything where `world` has it, at rest but for the obstacles, at time 0; `seed` replaces its own.
-
-        **Raises** `TwinError` for a world with other numbers of robots than the scenario's.
-        """
-        scenario, places, data = self.scenario, self._places, self.data
-        counts = scenario.pursuer_count, scenario.obstacle_count
-        check_robots(world, *counts)
-        self._seed = self._seed if seed is None else seed
-        self._target = np.asarray(world.target, float)
-        self._steps = 0
-        self._mujoco.mj_resetData(self.model, data)
+    def _begin(self, world: World, root: np.random.Generator) -> None:
+        places, data = self._places, self.data
         self._place(world)
         # Wheels sink a tenth of a millimetre into the floor; let them before the clock starts.
         for _ in range(round(_SETTLE / self.options.physics_step)):
@@ -117,20 +103,18 @@ class Twin:
             first = places.obstacle_velocities[index]
             data.qvel[first : first + 2] = velocity
             data.ctrl[places.obstacle_motors[index]] = velocity
-        still = np.zeros(2)
-        self._velocity = DelayLine(self.options.actuation_delay, still)
+        self._velocity = DelayLine(self.options.actuation_delay, np.zeros(2))
         self._known_heading = 0.0
-        self._commanded = np.zeros((counts[0], 2))
-        self.frames: list[Float[np.ndarray, "nq"]] = []
-        self.frame_times: list[float] = []
-        self._contacts = Watch(scenario, self._target)
+        self.command(np.zeros(2), np.zeros((self.counts[0], 2)))
         poses = self.poses_of(data.qpos[None])[0]
         moving = np.zeros((len(poses), 2))
-        for robot, first in enumerate(places.obstacle_velocities, 1 + counts[0]):
-            moving[robot] = data.qvel[first : first + 2]
-        root, step = np.random.default_rng(self._seed), self.options.physics_step
-        self._sensors = PoseSensors(self.options.sensors, counts, step, root)
+        moving[1 + self.counts[0] :] = self._drifts()
         self._sensors.watch_the_start(poses, moving)
+
+    def _drifts(self) -> Float[np.ndarray, "k 2"]:
+        """Velocities (m/s) of the obstacles."""
+        drifts = [self.data.qvel[first : first + 2] for first in self._places.obstacle_velocities]
+        return np.array(drifts, float).reshape(-1, 2)
 
     def _place(self, world: World) -> None:
         """Set x, y and heading of everything; heights stay."""
@@ -144,47 +128,40 @@ class Twin:
         for start, obstacle in zip(places.obstacles, np.asarray(world.obstacles, float), strict=True):
             qpos[start : start + 2] = obstacle[:2]
 
-    @property
-    def time(self) -> float:
-        """Seconds since the reset."""
-        return self._steps * self.options.physics_step
+    def command(
+        self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"], turn_rate: float = 0.0
+    ) -> None:
+        """As `Plant.command`; the evader's takes effect after the actuation delay."""
+        self._velocity.give(self.time, self._limited(velocity))
+        self._wheels = np.clip(np.nan_to_num(np.asarray(wheel_speeds, float)), -self._top, self._top)
+        self._since, self._from, self._wanted = self.time, self._evader(), np.asarray(velocity)
+
+    def _evader(self) -> Float[np.ndarray, "2"]:
+        """Where the evader is (m), in the precision of a `World`."""
+        first = self._places.evader
+        return self.data.qpos[first : first + 2].astype(np.float32)
 
     @property
-    def least_distances(self) -> tuple[float, float]:
-        """Least true distances (m) to a pursuer and to an obstacle since the reset; infinite without one."""
-        return self._contacts.least
-
-    def command(self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"]) -> None:
-        """What evader (m/s, world axes) and pursuers (rim speeds, m/s) are told now, cut to their limits.
-
-        It holds until the next; the evader's takes effect after the actuation delay.
-        """
-        wanted = np.asarray(velocity, float)
-        wanted = wanted if np.all(np.isfinite(wanted)) else np.zeros(2)
-        speed, limit = math.hypot(*wanted), self._limits["evader_speed"]
-        self._velocity.give(self.time, wanted * (limit / speed) if speed > limit else wanted)
-        top = self._limits["pursuer_speed"]
-        self._commanded = np.clip(np.nan_to_num(np.asarray(wheel_speeds, float)), -top, top)
+    def tracking_error(self) -> float:
+        elapsed = self.time - self._since
+        if not elapsed:
+            return 0.0
+        return float(np.hypot(*((self._evader() - self._from) / elapsed - self._wanted)))
 
     def advance(self, duration: float) -> Contacts:
-        """Let `duration` (s) pass, in whole physics steps, and say how near the evader came to what."""
-        step = self.options.physics_step
-        count = round((self.time + duration) / step) - self._steps
+        """Let `duration` (s) pass, in whole physics steps; returns how near the evader came to what."""
+        count = self._steps_in(duration)
         data, model, mj_step, places = self.data, self.model, self._mujoco.mj_step, self._places
         trace = np.empty((count, model.nq))
-        speeds = np.empty((0, 2)) if not len(self._commanded) else self._commanded / WHEEL_RADIUS
-        for motors, speed in zip(places.wheel_motors, speeds, strict=True):
+        for motors, speed in zip(places.wheel_motors, self._wheels / WHEEL_RADIUS, strict=True):
             data.ctrl[motors] = speed
-        every = max(round(1.0 / (_FRAME_RATE * step)), 1)
         in_effect = None
         for index in range(count):
             velocity = self._velocity.at(self.time)
             if velocity is not in_effect:
                 in_effect = velocity
                 self._drive(velocity)
-            if self._steps % every == 0:
-                self.frames.append(data.qpos.copy())
-                self.frame_times.append(self.time)
+            self._record()
             mj_step(model, data)
             self._steps += 1
             trace[index] = data.qpos
@@ -192,7 +169,7 @@ class Twin:
             raise TwinError(f"the physics became unstable at {self.time:.3f} s; use a smaller physics_step")
         poses = self.poses_of(trace)
         self._sensors.watch(self._steps - count + 1, poses)
-        return self._contacts.see(poses)
+        return self._watch.see(poses)
 
     def _drive(self, velocity: Float[np.ndarray, "2"]) -> None:
         """Set the evader's motors for a velocity (m/s, world axes)."""
@@ -218,8 +195,16 @@ class Twin:
             poses[:, robot, 2] = _heading(trace[:, start + 3 : start + 7])
         return poses
 
+    def _frame(self) -> Float[np.ndarray, "nq"]:
+        return self.data.qpos.copy()
+
+    def show(self, frame: Float[np.ndarray, "nq"]) -> None:
+        self.data.qpos[:] = frame
+
+    def places_of(self, frames: Any) -> Float[np.ndarray, "n robots 2"]:
+        return self.poses_of(np.asarray(frames))[..., :2]
+
     def measurements(self) -> list[Measurement]:
-        """What has arrived by now and was not handed out before; per robot, oldest first."""
         arrived = self._sensors.arrived(self.time)
         for one in arrived:
             if one.robot == "evader":
@@ -228,17 +213,14 @@ class Twin:
 
     @property
     def world(self) -> World:
-        """The truth now: positions, headings and velocities of the bodies."""
         data, places = self.data, self._places
         poses = self.poses_of(data.qpos[None])[0]
         m = len(places.pursuers)
-        drift = [data.qvel[first : first + 2] for first in places.obstacle_velocities]
-        moving = np.array(drift, float).reshape(-1, 2)
         rims = [[data.qvel[dof] * WHEEL_RADIUS for dof in pair] for pair in places.wheels]
         return World(
             evader=poses[0, :2],
             pursuers=poses[1 : 1 + m],
-            obstacles=np.concatenate([poses[1 + m :, :2], moving], axis=1),
+            obstacles=np.concatenate([poses[1 + m :, :2], self._drifts()], axis=1),
             target=self._target,
             time=self.time,
             evader_velocity=data.qvel[places.evader_velocity : places.evader_velocity + 2],
