@@ -85,11 +85,11 @@ class Decor:
                 geom, kind, width, np.array([*start, height]), np.array([*end, height])
             )
 
-    def ring(self, place: Any, radius: float, rgba: Any, height: float = 0.003, width: float = _LINE) -> None:
+    def ring(self, place: Any, radius: float, rgba: Any, height: float = 0.0) -> None:
         """A circle on the floor, or `height` (m) above it."""
         angles = np.linspace(0.0, 2.0 * math.pi, _RING + 1)
         circle = np.asarray(place)[:2] + radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        self.line(circle, height, width, rgba)
+        self.line(circle, height or 0.003, _LINE, rgba)
 
 
 def thinned(path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:

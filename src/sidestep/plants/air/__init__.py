@@ -5,7 +5,7 @@ from sidestep.plants.air.autopilot import Attitude, Autopilot, Gains, Setpoint
 from sidestep.plants.air.episode import FlightEpisode, Pilot, certificate_of, fly
 from sidestep.plants.air.flight import Flight
 from sidestep.plants.air.options import ROOM_SENSORS, FlightOptions, budget_of, errors_of
-from sidestep.plants.air.video import frames_of, write_video
+from sidestep.plants.video import frames_of, write_video
 
 __all__ = [
     "ROOM_SENSORS",

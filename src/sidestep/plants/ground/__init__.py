@@ -5,10 +5,10 @@ from sidestep.plants.ground.episode import TwinEpisode, run_twin, settings_for, 
 from sidestep.plants.ground.options import TwinOptions, bounded_errors
 from sidestep.plants.ground.robots import BASES
 from sidestep.plants.ground.twin import Twin
-from sidestep.plants.ground.video import frames_of, write_video
 from sidestep.plants.library import TwinError
 from sidestep.plants.options import PURSUER_SEES
 from sidestep.plants.sensors import SENSORS, Measurement, Sensors, changed_sensors, make_sensors
+from sidestep.plants.video import frames_of, write_video
 
 __all__ = [
     "BASES",
