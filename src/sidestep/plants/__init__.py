@@ -5,5 +5,6 @@ from sidestep.plants.plant import Plant
 from sidestep.plants.play import Robot, play
 from sidestep.plants.record import PlantEpisode
 from sidestep.plants.sensors import Measurement
+from sidestep.plants.simulation import Simulation
 
-__all__ = ["Contacts", "Measurement", "Plant", "PlantEpisode", "Robot", "Watch", "play"]
+__all__ = ["Contacts", "Measurement", "Plant", "PlantEpisode", "Robot", "Simulation", "Watch", "play"]
