@@ -1,36 +1,148 @@
-"""What `sidestep twin` and `sidestep fly` share: episodes in a physics simulator, one seed after another."""
+"""What `sidestep twin` and `sidestep fly` share: options, and the way from a policy to figures and files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from sidestep import _interrupts
-from sidestep.commands.common import CountBar, stood_still
+from sidestep.commands.common import (
+    CountBar,
+    Overrides,
+    PursuerName,
+    ScenarioName,
+    ShieldName,
+    policy_and_scenario,
+    stood_still,
+    write_json_file,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from sidestep.commands.fly import Fly
-    from sidestep.commands.twin import Twin
     from sidestep.plants import PlantEpisode
 
 
 @dataclass(frozen=True)
-class Played:
-    """`player` who decided for the robot, `first` episode, `figures` of all, and whether it was `interrupted`
-    before the last."""
+class PhysicsCommand:
+    """Options of a command that plays episodes in a physics simulator."""
 
-    player: Any
-    first: Any
-    figures: list[dict[str, Any]]
-    interrupted: bool
+    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
+    """Run folder whose policy to use, or goal-seeking for the untrained one."""
+    scenario: ScenarioName = "paper-test"
+    """Preset or file."""
+    shield: ShieldName = "joint"
+    """Shield: none, paper, game or joint."""
+    pursuer: PursuerName = "nash"
+    """Pursuer strategy."""
+    set: Overrides = ()
+    """Scenario fields to change, such as capture_distance=0.15."""
+    noise: Overrides = ()
+    """Fields of the sensors to change, such as position_noise=0.005 delay=0.05."""
+    pursuer_sees: Literal["truth", "measurements"] = "truth"
+    """What the pursuer decides from."""
+    seeds: int = 1
+    """Episodes, with the seeds from --seed on."""
+    seed: int = 0
+    """First seed, of starts and measurements."""
+    steps: int | None = None
+    """At most this many control periods; the scenario's episode_steps by default."""
+    out: Path | None = None
+    """Folder for the figure of the first episode beside the plain simulation, and its recording."""
+    video: Path | None = None
+    """Also render the first episode into this .mp4, .gif or .webp file."""
+    speed: float = 2.0
+    """How many times faster the video runs."""
+    rate: int = 25
+    """Pictures per second of the video."""
+    width: int = 960
+    """Width of the video in pixels; 16 by 9."""
+    json: Path | None = None
+    """Also write the figures to this file."""
 
 
-def check_amounts(command: Twin | Fly) -> None:
+@dataclass(frozen=True)
+class Plan:
+    """What a command does its own way.
+
+    `prepare()` makes the player that decides for the robot, `play(player, seed)` an episode. `counts` of all
+    episodes' figures, and what to `say` of them. `robots` that move; `report` what the report says of
+    `options`; `episodes` and `key` name the episodes in words and in the report, `stem` and `looks` are those
+    of the figure, whose simulation runs behind `shield_of` the player.
+    """
+
+    prepare: Callable[[], Any]
+    play: Callable[[Any, int], PlantEpisode]
+    counts: Callable[[list[dict[str, Any]]], dict[str, Any]]
+    say: Callable[[dict[str, Any]], None]
+    robots: str
+    options: Any
+    report: dict[str, Any]
+    episodes: str
+    key: str
+    stem: str
+    looks: dict[str, Any]
+    shield_of: Callable[[Any], Any]
+
+
+def run_on_plant(
+    command: PhysicsCommand, source: str, plan_of: Callable[[Any, Any], Plan], console: Console
+) -> int:
+    """Do as `plan_of(policy, scenario)` plans; returns the exit status. `source` is said in recordings.
+
+    While this lasts, the folder that the command writes is held; its amounts are checked before.
+    """
+    from sidestep.store.lock import hold
+
+    check_amounts(command)
+    with nullcontext() if command.out is None else hold(command.out):
+        policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
+        plan = plan_of(policy, scenario)
+        player, first, figures, interrupted = play_seeds(command, plan, console)
+        counts = plan.counts(figures)
+        episode_table(figures, counts, plan.episodes, console)
+        plan.say(counts)
+        report = {**setting(command, scenario, plan.options), **plan.report, **counts, plan.key: figures}
+        write_json_file(command.json, report)
+        if interrupted:
+            words = plan.episodes.split()[0]
+            console.print(f"Interrupted: {len(figures)} of {command.seeds} {words}.", highlight=False)
+            return 130
+        about = {"shield": command.shield, "pursuer": command.pursuer, "source": source}
+        if log := getattr(command, "log", None):
+            from sidestep.bridges.logs import save_log
+
+            save_log(
+                first.trajectory, scenario, log, about=about | {"seed": first.seed},
+                levels=first.levels, reactions=first.reactions,
+            )  # fmt: skip
+            console.print(f"Log: {log}", soft_wrap=True)
+        if command.out is not None:
+            from sidestep.loop import rollout, save_trajectory
+            from sidestep.views import twin_figure
+
+            stem, shield = command.out / plan.stem, plan.shield_of(player)
+            simulation = rollout(scenario, policy, shield, command.pursuer, first.seed, steps=command.steps)
+            save_trajectory(stem.with_suffix(".npz"), first.trajectory, scenario, about)
+            png, pdf = twin_figure(
+                scenario, simulation, first.trajectory, stem, shield=command.shield, **plan.looks
+            )
+            console.print(f"Figure: {png} and {pdf}", soft_wrap=True)
+        if command.video is not None:
+            from sidestep.plants.video import write_video
+
+            size = (round(command.width * 9 / 32) * 2, command.width)
+            path = write_video(first, command.video, rate=command.rate, speed=command.speed, size=size)
+            console.print(f"Video: {path}", soft_wrap=True)
+        return 0
+
+
+def check_amounts(command: PhysicsCommand) -> None:
     """**Raises** `ValueError` for a number of seeds, or an output, that there cannot be."""
     from sidestep._arrays import seed_number, whole_number
 
@@ -55,31 +167,12 @@ def check_amounts(command: Twin | Fly) -> None:
     try_outputs(files=[command.json, command.video], new=[log], folders=[command.out])
 
 
-@contextmanager
-def checked(command: Twin | Fly) -> Iterator[None]:
-    """While this lasts, the folder that the command writes is held; its amounts are checked before."""
-    from sidestep.store.lock import hold
-
-    check_amounts(command)
-    with nullcontext() if command.out is None else hold(command.out):
-        yield
-
-
-def video_options(command: Twin | Fly) -> dict[str, Any]:
-    """Speed, rate and size of the video, as `write_video` takes them."""
-    size = (round(command.width * 9 / 32) * 2, command.width)
-    return {"speed": command.speed, "rate": command.rate, "size": size}
-
-
 @_interrupts.held()
 def play_seeds(
-    command: Twin | Fly,
-    robots: str,
-    prepare: Callable[[], Any],
-    play: Callable[[Any, int], PlantEpisode],
-    console: Console,
-) -> Played:
-    """`play(player, seed)` for all the command's seeds, with the player that `prepare()` makes.
+    command: PhysicsCommand, plan: Plan, console: Console
+) -> tuple[Any, Any, list[dict[str, Any]], bool]:
+    """Play all the command's seeds: the player, the first episode, the figures of all, and whether it was
+    interrupted before the last.
 
     Says once what its shield's budget is warned of. After Ctrl-C what was played counts, if anything was.
     """
@@ -91,14 +184,14 @@ def play_seeds(
     first, interrupted = None, False
     with (
         warnings.catch_warnings(record=True) as warned,
-        CountBar(console, f"{command.shield} shield, {command.pursuer}, {robots}") as show,
+        CountBar(console, f"{command.shield} shield, {command.pursuer}, {plan.robots}") as show,
     ):
         warnings.simplefilter("always", BudgetWarning)
-        player = prepare()
+        player = plan.prepare()
         try:
             for number in range(command.seeds):
                 _interrupts.check()
-                episode = play(player, command.seed + number)
+                episode = plan.play(player, command.seed + number)
                 first = first or episode
                 figures.append(episode.to_dict())
                 show(number + 1, command.seeds)
@@ -108,10 +201,10 @@ def play_seeds(
                 raise
     for text in dict.fromkeys(str(one.message) for one in warned):
         console.print(f"Warning: {text}.", highlight=False)
-    return Played(player, first, figures, interrupted)
+    return player, first, figures, interrupted
 
 
-def setting(command: Twin | Fly, scenario: Any, options: Any) -> dict[str, Any]:
+def setting(command: PhysicsCommand, scenario: Any, options: Any) -> dict[str, Any]:
     """What was run, for the report."""
     import importlib.metadata
     from dataclasses import asdict
@@ -126,32 +219,6 @@ def setting(command: Twin | Fly, scenario: Any, options: Any) -> dict[str, Any]:
         "options": asdict(options),
         "versions": {name: importlib.metadata.version(name) for name in ("sidestep", "mujoco", "jax")},
     }
-
-
-def draw_beside_simulation(
-    command: Twin | Fly,
-    policy: Any,
-    shield: Any,
-    episode: PlantEpisode,
-    stem: Path,
-    about: dict[str, Any],
-    console: Console,
-    **looks: Any,
-) -> None:
-    """`stem`.npz, a recording of the episode, and `stem`.png and .pdf, the plain simulation beside it."""
-    from sidestep.loop import rollout, save_trajectory
-    from sidestep.views import twin_figure
-
-    scenario = episode.scenario
-    simulation = rollout(scenario, policy, shield, command.pursuer, episode.seed, steps=command.steps)
-    save_trajectory(stem.with_suffix(".npz"), episode.trajectory, scenario, about)
-    png, pdf = twin_figure(scenario, simulation, episode.trajectory, stem, shield=command.shield, **looks)
-    console.print(f"Figure: {png} and {pdf}", soft_wrap=True)
-
-
-def about_of(command: Twin | Fly, source: str) -> dict[str, Any]:
-    """What recordings say of where they come from."""
-    return {"shield": command.shield, "pursuer": command.pursuer, "source": source}
 
 
 def outcome_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
@@ -169,11 +236,10 @@ def outcome_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
     return counts
 
 
-def episode_table(figures: list[dict[str, Any]], what: str, console: Console) -> None:
+def episode_table(figures: list[dict[str, Any]], counts: dict[str, Any], what: str, console: Console) -> None:
     """A line for every episode, and the counts of all with 95 % bounds."""
     from rich.table import Table
 
-    counts = outcome_counts(figures)
     for figure in figures:
         least = [
             f", least distance to a{word} {figure[name]:.4f} m"
