@@ -1,4 +1,4 @@
-"""What do the parameters mean to `sidestep`: which scenario, which settings of the decision core?"""
+"""What do the parameters mean to `sidestep`: which scenario, settings of the decision core, plant?"""
 
 import json
 from typing import Any
@@ -39,6 +39,24 @@ def make_scenario(values: dict[str, Any]) -> Any:
     try:
         return load_scenario(values["scenario"], **fields)
     except (ScenarioError, OSError) as error:
+        raise ConfigurationError([str(error)]) from error
+
+
+def make_plant(values: dict[str, Any], scenario: Any) -> Any:
+    """What moves in the twin, a `sidestep.plants.Plant`: the plain simulation, or bodies in MuJoCo.
+
+    **Raises** `ConfigurationError` for sensors or a base that there are not, and without MuJoCo.
+    """
+    if values["physics"] == "plain":
+        from sidestep.plants import Simulation
+
+        return Simulation(scenario, values["evader_heading"])
+    from sidestep.plants.ground import Twin, TwinError, TwinOptions, make_sensors
+
+    try:
+        options = TwinOptions(base=values["base"], sensors=make_sensors(values["sensors"]))
+        return Twin(scenario, options, values["seed"])
+    except TwinError as error:
         raise ConfigurationError([str(error)]) from error
 
 

@@ -14,9 +14,8 @@ from sidestep_ros import quality, reports
 from sidestep_ros.commands import Attitude, Commands
 from sidestep_ros.messages import COMMAND_TYPES, NANOSECONDS, POSE_TYPES, UnusableMessageError, write_pose
 from sidestep_ros.parameters import SCENARIO, TOPICS, TWIN, ConfigurationError, declare
-from sidestep_ros.physics import Contacts, MujocoPhysics, Physics, PlainPhysics
 from sidestep_ros.running import run, tune_jax
-from sidestep_ros.settings import check_topics, make_scenario
+from sidestep_ros.settings import check_topics, make_plant, make_scenario
 from sidestep_ros.times import Times
 
 _REPORT_SECONDS = 1.0
@@ -46,7 +45,7 @@ class TwinNode(Node):
         self._complaints = reports.Complaints()
         self._wheels_for = self._make_pursuer(values["pursuer"])
         self._start = self._make_start()
-        self._physics = self._make_physics()
+        self._plant = make_plant(values, self.scenario)
         self._counts = {"captured": 0, "collided": 0, "reached": 0, "commands": 0}
         self._least = math.inf
         self._random = np.random.default_rng(values["seed"])
@@ -60,7 +59,7 @@ class TwinNode(Node):
         self.create_subscription(
             COMMAND_TYPES[self._commands.kind], self.values["command.topic"], self._obey, quality.COMMANDS
         )
-        rate = self.values["pose_rate"] or self._physics.pose_rate
+        rate = self.values["pose_rate"] or self._plant.pose_rate
         self.create_timer(1.0 / rate, self._tick, clock=self._times.timer_clock)
         self.create_timer(_REPORT_SECONDS, self._report, clock=self._times.timer_clock)
         self._moved_at = self._times.of_cycle()
@@ -94,12 +93,6 @@ class TwinNode(Node):
         reset = eqx.filter_jit(lambda scenario, key: scenario.reset(key))
         return lambda seed: reset(self.scenario, jax.random.key(seed))
 
-    def _make_physics(self) -> Physics:
-        values = self.values
-        if values["physics"] == "plain":
-            return PlainPhysics(self.scenario, values["evader_heading"])
-        return MujocoPhysics(self.scenario, values["sensors"], values["base"], values["seed"])
-
     def _make_pose_publishers(self) -> dict[tuple[str, int], Any]:
         values = self.values
         topics = {("evader", 0): (values["evader.topic"], values["evader.type"])}
@@ -116,7 +109,7 @@ class TwinNode(Node):
         world = self._start(seed)
         self._goal = np.asarray(world.target, float)
         self._wheels = self._wheels_for(world)
-        self._physics.reset(world, seed)
+        self._plant.reset(world, seed)
         self._time = self._steer_at = 0.0
         self._command = (-math.inf, (0.0, 0.0), 0.0)
 
@@ -134,9 +127,9 @@ class TwinNode(Node):
         self._move()
         if self._time >= self._steer_at:
             self._steer_at = max(self._steer_at + self._period, self._time)
-            self._wheels = self._wheels_for(self._physics.world)
+            self._wheels = self._wheels_for(self._plant.world)
         now = self.get_clock().now()
-        for robot, index, stamp, pose in self._physics.measurements():
+        for robot, index, stamp, pose in self._plant.measurements():
             if robot == "evader":
                 self._attitude.see(self._times.now() + stamp - self._time, pose[2])
             kind, publisher = self._pose_publishers[robot, index]
@@ -154,13 +147,15 @@ class TwinNode(Node):
         # A simulated clock may have gone back since.
         if not 0.0 <= now - when <= self.values["command_timeout"]:
             velocity, turn_rate = (0.0, 0.0), 0.0
-        self._physics.command(velocity, turn_rate, self._wheels)
-        contacts = self._physics.advance(passed)
+        self._plant.command(np.asarray(velocity, float), self._wheels, turn_rate)
         self._time += passed
-        self._happened(contacts)
+        # MuJoCo moves on in whole steps: what one stretch leaves over, the next one makes up for.
+        self._happened(self._plant.advance(self._time - self._plant.time))
 
-    def _happened(self, contacts: Contacts) -> None:
-        self._least = min(self._least, contacts.clearance)
+    def _happened(self, contacts: Any) -> None:
+        to_pursuer = contacts.pursuer_distance - float(self.scenario.capture_distance)
+        to_obstacle = contacts.obstacle_distance - float(self.scenario.collision_distance)
+        self._least = min(self._least, to_pursuer, to_obstacle)
         for name in ("captured", "collided"):
             if getattr(contacts, name):
                 self._counts[name] += 1
@@ -169,7 +164,7 @@ class TwinNode(Node):
             self._report()
             self._begin()
             return
-        x, y = map(float, self._physics.world.evader)
+        x, y = map(float, self._plant.world.evader)
         if math.hypot(x - self._goal[0], y - self._goal[1]) <= float(self.scenario.reach_distance):
             self._counts["reached"] += 1
             if self.values["new_targets"]:
@@ -177,7 +172,7 @@ class TwinNode(Node):
 
     def _set_new_target(self) -> None:
         """Another target in the arena, not at an obstacle and not where the evader is."""
-        world, half = self._physics.world, float(self.scenario.arena_side) / 2.0
+        world, half = self._plant.world, float(self.scenario.arena_side) / 2.0
         taken = [*np.asarray(world.obstacles, float)[:, :2], np.asarray(world.evader, float)]
         apart = float(self.scenario.target_separation)
         for _ in range(1000):

@@ -6,6 +6,7 @@ import math
 from typing import final
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -25,8 +26,8 @@ def _step(
     """`Scenario.step` over `duration` (s), which ends at `time` (s), and how near the target was (m)."""
     held = eqx.tree_at(lambda scenario: scenario.control_period, scenario, duration)
     moved, events = held.step(world, velocity, wheels)
-    chord = (moved.evader - world.evader) / duration
-    to_target = closest_approach_straight(world.evader - world.target, chord, duration)
+    chord, once = moved.evader - world.evader, jnp.ones_like(duration)
+    to_target = closest_approach_straight(world.evader - world.target, chord, once)
     return eqx.tree_at(lambda moved: moved.time, moved, time), events, to_target
 
 
