@@ -70,16 +70,15 @@ class PhysicsCommand:
 class Plan:
     """What a command does its own way.
 
-    `prepare()` makes the player that decides for the robot, `play(player, seed)` an episode. `counts` of all
-    episodes' figures, and what to `say` of them. `robots` that move; `report` what the report says of
-    `options`; `episodes` and `key` name the episodes in words and in the report, `stem` and `looks` are those
-    of the figure, whose simulation runs behind `shield_of` the player.
+    - `prepare()` makes the player that decides for the robot, `play(player, seed)` an episode
+    - `robots` that move, with their `options`; `report` what else the report says of them
+    - `episodes`, what they are called in words, and `key`, in the report
+    - `stem` and `looks` of the figure, whose simulation runs behind `shield_of(player)`
+    - `counts` of the episodes' figures, and what to `say` of them
     """
 
     prepare: Callable[[], Any]
     play: Callable[[Any, int], PlantEpisode]
-    counts: Callable[[list[dict[str, Any]]], dict[str, Any]]
-    say: Callable[[dict[str, Any]], None]
     robots: str
     options: Any
     report: dict[str, Any]
@@ -88,6 +87,8 @@ class Plan:
     stem: str
     looks: dict[str, Any]
     shield_of: Callable[[Any], Any]
+    counts: Callable[[list[dict[str, Any]]], dict[str, Any]]
+    say: Callable[[dict[str, Any]], None] = lambda counts: None
 
 
 def run_on_plant(

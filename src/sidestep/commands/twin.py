@@ -70,8 +70,6 @@ def _plan(command: Twin, policy: Any, scenario: Any) -> Plan:
     return Plan(
         prepare=prepare,
         play=play,
-        counts=outcome_counts,
-        say=lambda counts: None,
         robots=command.base,
         options=options,
         report={"budget": {name: float(getattr(settings.budget, name)) for name in _BUDGET}},
@@ -80,4 +78,5 @@ def _plan(command: Twin, policy: Any, scenario: Any) -> Plan:
         stem="twin",
         looks={"twin_words": f"physics twin, {command.base}, {command.sensors}"},
         shield_of=lambda onboard: command.shield,
+        counts=outcome_counts,
     )

@@ -21,8 +21,7 @@ def rgba(colour: str, alpha: float = 1.0) -> Float[np.ndarray, "4"]:
 
 def mjcf_colour(colour: str, alpha: float = 1.0) -> str:
     """A colour `#rrggbb` as MJCF wants it."""
-    channels = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-    return " ".join(f"{channel:.4f}" for channel in (*channels, alpha))
+    return " ".join(f"{channel:.4f}" for channel in rgba(colour, alpha))
 
 
 def studio(*, shadows: int, view: str, tiles: int) -> str:
