@@ -11,7 +11,7 @@ import pytest
 
 from sidestep.cli import main
 from sidestep.safety import make_shield
-from sidestep.safety.certificate.certificate import certify
+from sidestep.safety.certificate import certify
 from sidestep.safety.certificate.flow_map import seen_from, side_value, turn_drive_turn
 from sidestep.safety.certificate.nearest_changes import PARAMETERS
 from sidestep.safety.certificate.sampled_design import FINE, delay_cost, holds

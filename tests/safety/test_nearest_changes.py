@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sidestep.cli import main
-from sidestep.safety.certificate.certificate import certify, clearance_of
+from sidestep.safety.certificate.guarantee import certify, clearance_of
 from sidestep.safety.certificate.nearest_changes import (
     MINE,
     PARAMETERS,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sidestep.safety.certificate.certificate import certify
+from sidestep.safety.certificate import certify
 from sidestep.safety.certificate.flow_map import side_value
 from sidestep.views import certificate_figure
 from sidestep.views.certificate_figure import set_outline

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.text import Text
 
 from sidestep.loop import load_episode, save_trajectory
-from sidestep.safety.certificate.certificate import certify
+from sidestep.safety.certificate import certify
 from sidestep.views import (
     certificate_figure,
     reward_figure,

@@ -72,7 +72,7 @@ def run(command: Certify, console: Console) -> int:
         return 0
     from rich.console import Console as RichConsole
 
-    from sidestep.safety.certificate.certificate import certify
+    from sidestep.safety.certificate import certify
     from sidestep.store.outputs import try_outputs
     from sidestep.world import load_scenario, robot_fields
 

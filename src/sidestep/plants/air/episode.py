@@ -20,7 +20,7 @@ from sidestep.plants.play import Robot, play, see
 from sidestep.plants.record import PlantEpisode
 from sidestep.robot import Decision, Onboard, OnboardSettings
 from sidestep.safety import AdaptedShield, Certificate, Shield, as_shield, certify, make_shield
-from sidestep.safety.certificate.certificate import start_margin
+from sidestep.safety.certificate import start_margin
 from sidestep.safety.shields.catalogue import BUDGETED
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame

@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from sidestep.safety.certificate.certificate import Certificate
+from sidestep.safety.certificate.certificate import Certificate, Claim
 
 PROVED, COMPUTED, MEASURED, NOT_CLAIMED = "proved", "computed", "measured", "not claimed"
-
-
-@dataclass(frozen=True)
-class Claim:
-    """One statement; `kind` is `proved`, `computed`, `measured` or `not claimed`."""
-
-    kind: str
-    text: str
 
 
 def claims_of(certificate: Certificate) -> tuple[Claim, ...]:
