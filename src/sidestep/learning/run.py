@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import sidestep
 from sidestep import _interrupts
 from sidestep._arrays import seed_number, whole_number
+from sidestep._version import __version__
 from sidestep.learning.curves import Curves
 from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
@@ -163,7 +163,7 @@ def train(
         "pursuer": _name(pursuer),
         "seed": int(seed),
         "episodes": int(episodes),
-        "version": sidestep.__version__,
+        "version": __version__,
     }
     folder = None if out is None else Path(out)
     with nullcontext() if folder is None else records.writing(folder, resume=resume):
