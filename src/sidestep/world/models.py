@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import abc
-from typing import TYPE_CHECKING
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arrays import Scalar, real
-
-if TYPE_CHECKING:
-    from sidestep.world.scenario import Scenario
-    from sidestep.world.state import World
+from sidestep.world.state import World
 
 
 class EvaderState(eqx.Module):
@@ -33,25 +30,25 @@ class EvaderModel(eqx.Module):
     told, what is guaranteed for an omnidirectional evader is guaranteed for this robot. `probe_evader`
     measures whether it does.
 
-    Functions see one robot, no batch. Numbers may be fields; as JAX arrays they are traced, as plain ones
-    another value compiles anew.
+    Functions see one robot, no batch, and the `Scenario` that it is in. Numbers may be fields; as JAX arrays
+    they are traced, as plain ones another value compiles anew.
     """
 
-    def start(self, scenario: Scenario, key: PRNGKeyArray) -> Float[Array, "s"]:
+    def start(self, scenario: Any, key: PRNGKeyArray) -> Float[Array, "s"]:
         """What the model keeps beside position and velocity, at the start of an episode: nothing."""
         return jnp.zeros(0, dtype=float)
 
     @abc.abstractmethod
     def after(
-        self, scenario: Scenario, robot: EvaderState, command: Float[Array, "2"], time: Scalar
+        self, scenario: Any, robot: EvaderState, command: Float[Array, "2"], time: Scalar
     ) -> EvaderState:
         """The robot `time` (s) later, told the velocity `command` (m/s, world axes, |u| <= v_e) meanwhile."""
 
-    def control_point(self, scenario: Scenario, robot: EvaderState) -> Float[Array, "2"]:
+    def control_point(self, scenario: Any, robot: EvaderState) -> Float[Array, "2"]:
         """The point (m) that moves as told: p' = u. The robot's position, unless a model says otherwise."""
         return robot.position
 
-    def offset(self, scenario: Scenario) -> Scalar:
+    def offset(self, scenario: Any) -> Scalar:
         """How far (m) the control point can be from the robot's position, at most."""
         return real(0.0)
 
@@ -72,14 +69,14 @@ class PursuerModel(eqx.Module):
     """
 
     @abc.abstractmethod
-    def limit(self, scenario: Scenario, speed: Scalar, turn_rate: Scalar) -> tuple[Scalar, Scalar]:
+    def limit(self, scenario: Any, speed: Scalar, turn_rate: Scalar) -> tuple[Scalar, Scalar]:
         """The pair (m/s, rad/s) that is driven when this one is asked for; finite for finite numbers."""
 
     @abc.abstractmethod
-    def corners(self, scenario: Scenario) -> Float[Array, "n 2"]:
+    def corners(self, scenario: Any) -> Float[Array, "n 2"]:
         """Pairs (m/s, rad/s) whose convex hull holds all that it can take."""
 
-    def covering(self, scenario: Scenario) -> tuple[Scalar, Scalar] | None:
+    def covering(self, scenario: Any) -> tuple[Scalar, Scalar] | None:
         """Rim speed V (m/s) and half axle b (m) of a differential drive that can do all this pursuer can,
         |v| + b |omega| <= V: what the shields then guard against. None if there is none."""
         return None
