@@ -137,6 +137,19 @@ def test_every_public_name_can_be_imported():
         sidestep.nothing  # noqa: B018
 
 
+def test_only_the_shields_room_asks_what_kind_of_shield_it_has():
+    """Everybody else asks the shield itself: a new one then needs no other change."""
+    asked = []
+    for path in (ROOT / "src").rglob("*.py"):
+        if path.parent.name == "shields":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            call = ast.unparse(node) if isinstance(node, ast.Call) else ""
+            if call.startswith("isinstance(") and "Shield" in call:
+                asked.append(f"{path.name}:{node.lineno}")
+    assert asked == []
+
+
 def test_docs_name_options_with_their_real_defaults():
     defaults = options_to_dict(make_options())
     row = re.compile(r"`(\w+)=([^`]+)` \(`?[^)]*\)")

@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 
 from sidestep.pursuit import make_pursuer
-from sidestep.safety import SHIELDS, JointShield, PursuitBarrier, Status, as_shield, make_shield
+from sidestep.safety import (
+    PURSUIT_SHIELDS,
+    SHIELDS,
+    JointShield,
+    PursuitBarrier,
+    RangeBarrier,
+    Status,
+    as_shield,
+    make_shield,
+    name_of,
+    shield_of,
+)
 from sidestep.world import World, load_scenario
 
 every_shield = pytest.mark.parametrize("name", SHIELDS)
@@ -219,6 +230,38 @@ def test_gradients_through_a_shield_are_finite(precision, name):
         for nominal in ((0.0, 0.0), (0.1574, 0.0), (1.0, 1.0)):
             gradient = slope(_scene(evader, obstacles=(0.0, 0.0, 0.0, 0.0)), jnp.array(nominal))
             assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("name", [*SHIELDS, "custom"])
+def test_the_rows_that_a_shield_names_are_those_it_kept(name):
+    """The page draws them, and a robot that is late falls back to them."""
+    scenario = load_scenario("paper")
+    shield = shield_of(RangeBarrier(), scenario, probe=False) if name == "custom" else _shield(name, scenario)
+    world, nominal = _scene(pursuers=(0.6, 0.3, 3.0), obstacles=(-0.4, 0.1, 0.02, 0.0)), jnp.array([0.1, 0.1])
+    result, memory = _run(shield, world, nominal, shield.init(world))
+    rows = shield.rows(world, memory)
+    if name == "none":
+        assert rows is None
+        return
+    by_rows, _ = eqx.filter_jit(shield.filter_by_rows)(world, nominal, shield.init(world))
+    for answer in (result, by_rows) if name != "joint" else (by_rows,):
+        left = jnp.min(rows.normals @ answer.action - rows.offsets)
+        np.testing.assert_allclose(left, answer.slack, atol=1e-6)
+        np.testing.assert_allclose(rows.values, answer.barriers, atol=1e-3)
+
+
+def test_which_shields_keep_the_pursuit_barrier_is_said_by_them_and_for_custom_robots_too():
+    scenario, quadrotor = load_scenario("paper"), load_scenario("quadrotor")
+    for name in SHIELDS:
+        plain, adapted = make_shield(name, scenario), make_shield(name, quadrotor)
+        assert plain.unadapted is plain
+        assert adapted.unadapted is adapted.inner
+        assert plain.keeps_pursuit_barrier == adapted.keeps_pursuit_barrier == (name in PURSUIT_SHIELDS)
+        assert plain.looks_ahead == adapted.looks_ahead == (name == "joint")
+        assert name_of(plain, scenario) == name
+        assert len(plain.plan(_scene(), plain.init(_scene()))) == (33 if name == "joint" else 0)
+    assert PURSUIT_SHIELDS == ("game", "joint")
+    assert name_of(make_shield("game", load_scenario("paper", pursuer_gain=2.0)), scenario) is None
 
 
 def test_unknown_shields_are_refused_with_the_names_there_are():

@@ -50,7 +50,7 @@ class Export:
 def run(command: Export, console: Console) -> int:
     """Run `sidestep export`; returns the exit status."""
     from sidestep.learning import load_policy
-    from sidestep.safety import Budget, GameShield, make_shield
+    from sidestep.safety import Budget, make_shield
     from sidestep.store.files import is_stream
     from sidestep.store.outputs import try_outputs
 
@@ -75,14 +75,13 @@ def run(command: Export, console: Console) -> int:
         scenario.check_built_in("an exported filter", ALONE)
     names = ("position_error", "heading_error", "delay", "tracking_error")
     errors = {error: getattr(command, error) for error in names}
-    shield = make_shield(name, scenario, Budget(**errors) if any(errors.values()) else None)
+    shield: Any = make_shield(name, scenario, Budget(**errors) if any(errors.values()) else None)
     about: dict[str, Any]
     options = {"what": command.what, "run": command.run, "overwrite": command.overwrite}
     if command.format == "onnx":
         from sidestep.bridges.export import export_onnx
 
-        game = shield if isinstance(shield, GameShield) else None
-        about = export_onnx(command.out, scenario, policy, shield=game, **options)
+        about = export_onnx(command.out, scenario, policy, shield=shield, **options)
     else:
         from sidestep.bridges.export import export_jax
 

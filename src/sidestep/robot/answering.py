@@ -76,9 +76,11 @@ class Answering:
     """A shield and a policy compiled into one call of one vector in and one out.
 
     On small computers most of a decision's time is what it costs to hand many small arrays over.
+
+    `rows_only`: the shield decides by its rows, without looking ahead. The memory is the same.
     """
 
-    def __init__(self, shield: Shield, policy: Callable[..., Any] | None):
+    def __init__(self, shield: Shield, policy: Callable[..., Any] | None, *, rows_only: bool = False):
         scenario = shield.scenario
         self._arrays, fixed = eqx.partition((shield, policy), eqx.is_array)
         m, k = scenario.pursuer_count, scenario.obstacle_count
@@ -92,7 +94,11 @@ class Answering:
             evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
             world = World(evader, pursuers, obstacles, target, time, velocity, wheels)
             wished, ask, flee, delay = parts[7:]
-            outcome, memory = _answer(shield, policy, world, wished, ask, flee, delay, memory)
+            shield = shield.with_delay(delay)
+            nominal = _nominal(shield.scenario, policy, world, wished, ask, flee)
+            result, memory = (shield.filter_by_rows if rows_only else shield)(world, nominal, memory)
+            outcome = [nominal, result.action, result.status.astype(nominal.dtype), result.slack]
+            outcome += [result.intervention, clearance(shield.scenario, world), result.barriers]
             return jnp.concatenate([jnp.atleast_1d(part) for part in outcome]), memory
 
         self._compiled = answer
@@ -114,22 +120,9 @@ class Answering:
         return Answer.of(np.asarray(vector, np.float64), self._count), memory
 
 
-def _answer(
-    shield: Any,
-    policy: Any,
-    world: World,
-    wished: Array,
-    ask: Array,
-    flee: Array,
-    delay: Array,
-    memory: Any,
-) -> tuple[list[Array], Any]:
-    """The parts of an `Answer`, and the next memory.
-
-    `ask` the policy, if there is one, instead of taking the wish; `flee`: instead of either, full speed away
-    from the nearest pursuer.
-    """
-    scenario: Scenario = shield.scenario
+def _nominal(scenario: Scenario, policy: Any, world: World, wished: Array, ask: Array, flee: Array) -> Array:
+    """The velocity (m/s) to filter: `ask` the policy, if there is one, instead of taking the wish; `flee`:
+    instead of either, full speed away from the nearest pursuer."""
     nominal = wished
     if policy is not None:
         nominal = jnp.where(ask > 0.0, decide(scenario, policy, world), wished)
@@ -141,9 +134,4 @@ def _answer(
         rows = barrier.rows(scenario, world, barrier.remember(scenario, world))
         away = rows.normals[jnp.argmin(rows.values)]
         nominal = jnp.where(flee > 0.0, scenario.evader_speed * away, nominal)
-    if getattr(shield, "budget", None) is not None:
-        shield = eqx.tree_at(lambda shield: shield.budget.delay, shield, delay)
-    result, memory = shield(world, nominal, memory)
-    status = result.status.astype(nominal.dtype)
-    near = clearance(scenario, world)
-    return [nominal, result.action, status, result.slack, result.intervention, near, result.barriers], memory
+    return nominal

@@ -6,11 +6,9 @@ at which they were true, ask it once per control period, and drive what it answe
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
 
@@ -28,9 +26,7 @@ from sidestep.robot.intake import Intake
 from sidestep.robot.pace import Pace
 from sidestep.robot.readings import LARGEST, Reading, as_numbers
 from sidestep.robot.settings import OnboardSettings
-from sidestep.safety import JointShield, Shield, Status, make_shield
-from sidestep.safety.shields.catalogue import BUDGETED
-from sidestep.safety.shields.way_out import way_out
+from sidestep.safety import PURSUIT_SHIELDS, Shield, Status, make_shield
 from sidestep.world import Scenario, World
 
 
@@ -75,12 +71,12 @@ class Onboard:
         settings = self.settings
         self.settings.budget.check(scenario)
         if isinstance(shield, str):
-            budget = settings.budget if shield in BUDGETED else None
+            budget = settings.budget if shield in PURSUIT_SHIELDS else None
             shield = make_shield(shield, scenario, budget)
             # Motors that turn the robot round within a period are as good as none.
             gained = settings.motor_acceleration * float(scenario.control_period)
-            if isinstance(shield, JointShield) and gained < 2.0 * float(scenario.evader_speed):
-                shield = dataclasses.replace(shield, acceleration=settings.motor_acceleration)
+            if gained < 2.0 * float(scenario.evader_speed):
+                shield = shield.with_acceleration(settings.motor_acceleration)
         self._shield = shield
         self._init = eqx.filter_jit(shield.init)
         if isinstance(policy, (str, Path)) and policy != GOAL_SEEKING:
@@ -88,8 +84,7 @@ class Onboard:
         self._policy = None if policy is None else as_policy(policy, scenario)
         self._decision_steps = 1 if policy is None else decision_steps_of(self._policy)
         self._whole = Answering(shield, self._policy)
-        rows = shield.rows_only if isinstance(shield, JointShield) else None
-        self._rows = None if rows is None else Answering(rows, self._policy)
+        self._rows = Answering(shield, self._policy, rows_only=True) if shield.looks_ahead else None
         self._period = float(scenario.control_period)
         self._speed = float(scenario.evader_speed)
         self._target = np.full(2, np.nan) if policy is not None else np.zeros(2)
@@ -168,7 +163,7 @@ class Onboard:
         memory = self._init(seen.world())
         self._whole(seen, place, True, False, 0.0, memory)
         if self._rows is not None:
-            self._rows(seen, place, True, False, 0.0, memory.sides)
+            self._rows(seen, place, True, False, 0.0, memory)
         return time.perf_counter() - begun
 
     def decide(self, now: Any) -> Decision:
@@ -206,11 +201,9 @@ class Onboard:
         delay = max(delay, float(self.settings.budget.delay)) + lateness
         ask = self._decided % self._decision_steps == 0
         flee = level >= LEVELS.index("evade")
-        if self._pace.behind and self._rows is not None:
-            answer, sides = self._rows(seen, wished, ask, flee, delay, self._memory.sides)
-            self._memory = eqx.tree_at(lambda memory: memory.sides, self._memory, sides)
-        else:
-            answer, self._memory = self._whole(seen, wished, ask, flee, delay, self._memory)
+        answering = (self._rows if self._pace.behind else None) or self._whole
+        answer, memory = answering(seen, wished, ask, flee, delay, self._memory)
+        self._memory = memory
         if not np.all(np.isfinite(answer.action)):
             self._forget_plan()
             reactions.append("the shield's answer was not finite: stopped for this period")
@@ -233,14 +226,8 @@ class Onboard:
             latency=now - self._estimates.newest() + computed,
             compute_seconds=computed,
             _seen=seen,
-            _plan=self._planner(seen, self._memory),
+            _plan=lambda: np.asarray(self._shield.plan(seen.world(), memory), float),
         )
-
-    def _planner(self, seen: Seen, memory: Any) -> Callable[[], Float[np.ndarray, "n 2"]]:
-        shield = self._shield
-        if not isinstance(shield, JointShield) or not self.scenario.pursuer_count:
-            return lambda: np.zeros((0, 2))
-        return lambda: np.asarray(way_out(shield, seen.world(), memory), float)
 
     def _turned_back(self, now: float) -> list[str]:
         """The clock goes back to `now` (s), or stands still: what happened and was forgotten, in words."""

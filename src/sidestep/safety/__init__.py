@@ -26,6 +26,7 @@ from sidestep.safety.filter import (
 )
 from sidestep.safety.shields import (
     BARRIERS,
+    PURSUIT_SHIELDS,
     SHIELDS,
     AdaptedShield,
     BarrierShield,
@@ -37,9 +38,11 @@ from sidestep.safety.shields import (
     Shield,
     ShieldResult,
     as_shield,
+    checked_shield,
     covered,
     filter_in_lanes,
     make_shield,
+    name_of,
     of_control_point,
     shield_of,
     start_in_lanes,
@@ -47,6 +50,7 @@ from sidestep.safety.shields import (
 
 __all__ = [
     "BARRIERS",
+    "PURSUIT_SHIELDS",
     "SHIELDS",
     "AdaptedShield",
     "Barrier",
@@ -73,11 +77,13 @@ __all__ = [
     "Status",
     "as_shield",
     "certify",
+    "checked_shield",
     "compose",
     "covered",
     "filter_in_lanes",
     "grid_barrier",
     "make_shield",
+    "name_of",
     "of_control_point",
     "probe_barrier",
     "project",

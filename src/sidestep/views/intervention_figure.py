@@ -14,8 +14,8 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.patches import Arc, Circle, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
+from sidestep.safety import PURSUIT_SHIELDS
 from sidestep.trials import InterventionMap
-from sidestep.views.outlines import PURSUIT_SHIELDS
 from sidestep.views.scene import CAPTURE_SET_LOOK, capture_set_outline, correction_colours, guarded
 from sidestep.views.style import (
     COLUMN,

@@ -15,9 +15,6 @@ from sidestep.views.scene import LEVEL_COLOUR, LEVELS, capture_set_outline, guar
 from sidestep.views.style import INK
 from sidestep.world import Scenario, World
 
-PURSUIT_SHIELDS = ("game", "joint")
-"""Shields whose barrier towards a pursuer is that of the game; others keep a distance."""
-
 _POINTS = 121
 
 

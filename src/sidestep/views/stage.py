@@ -17,9 +17,9 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from sidestep.loop import Trajectory
+from sidestep.safety import PURSUIT_SHIELDS
 from sidestep.views.motion import Instant, Motion
 from sidestep.views.moving_panel import NOMINAL_DASHES, MovingPanel
-from sidestep.views.outlines import PURSUIT_SHIELDS
 from sidestep.views.scene import (
     CAPTURE_SET_LOOK,
     LEVEL_COLOUR,

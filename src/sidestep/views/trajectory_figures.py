@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from sidestep.loop import Trajectory
-from sidestep.safety import Status
-from sidestep.views.outlines import PURSUIT_SHIELDS, LevelOutlines, draw_barrier_levels
+from sidestep.safety import PURSUIT_SHIELDS, Status
+from sidestep.views.outlines import LevelOutlines, draw_barrier_levels
 from sidestep.views.scene import (
     CAPTURE_SET_LOOK,
     LEVEL_COLOUR,

@@ -12,7 +12,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sidestep._packages import needed
-from sidestep.safety import GameShield, JointShield
 from sidestep.views.motion import Instant
 from sidestep.views.moving_panel import MovingPanel
 from sidestep.views.scene import correction_colours
@@ -43,7 +42,7 @@ class Picture:
 
     def __init__(self, scenario: Scenario, shield: Any):
         self._scenario = scenario
-        self._pursuit = isinstance(shield, (GameShield, JointShield))
+        self._pursuit = shield.keeps_pursuit_barrier
         self._velocity = eqx.filter_jit(to_velocity)
         self._window: Any = None
         self._half = 0.0

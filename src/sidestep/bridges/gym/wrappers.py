@@ -13,24 +13,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from sidestep._arrays import real, select
-from sidestep.safety import Shield, Status, filter_in_lanes, start_in_lanes
+from sidestep.safety import Shield, Status, checked_shield, filter_in_lanes, start_in_lanes
 from sidestep.world import World
 
 
 def in_lanes(worlds: World) -> World:
     """Many worlds with their axis in front, as those that compute in lanes take them."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(real(leaf), 0, -1), worlds)
-
-
-def checked_shield(shield: Any) -> Shield:
-    """**Raises** `ValueError` for anything but a shield: a name alone does not say for which robots."""
-    if isinstance(shield, Shield):
-        return shield
-    name = shield if isinstance(shield, str) else "joint"
-    raise ValueError(
-        f"shield = {shield!r}: it must be a sidestep.Shield, such as make_shield({name!r}, scenario) with "
-        "the Scenario of the robots in this environment"
-    )
 
 
 def _call(shield: Shield, world: World, nominal: Any, memory: Any) -> Any:

@@ -19,9 +19,8 @@ from sidestep.plants.air.options import FlightOptions, budget_of, check_scenario
 from sidestep.plants.play import Robot, play, see
 from sidestep.plants.record import PlantEpisode
 from sidestep.robot import Decision, Onboard, OnboardSettings
-from sidestep.safety import AdaptedShield, Certificate, Shield, as_shield, certify, make_shield
+from sidestep.safety import PURSUIT_SHIELDS, Certificate, Shield, as_shield, certify, make_shield
 from sidestep.safety.certificate import start_margin
-from sidestep.safety.shields.catalogue import BUDGETED
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import to_pursuer_frame
 
@@ -88,10 +87,11 @@ class Pilot(Robot):
         self.scenario, self.options = scenario, options or FlightOptions()
         check_scenario(scenario, self.options)
         if isinstance(shield, str):
-            budget = budget_of(self.options) if shield in BUDGETED else None
+            budget = budget_of(self.options) if shield in PURSUIT_SHIELDS else None
             shield = make_shield(shield, scenario, budget)
         adapted = as_shield(shield, scenario)
-        if not isinstance(adapted, AdaptedShield):
+        inner = adapted.unadapted
+        if inner is adapted:
             raise ValueError(
                 f"shield = {type(adapted).__name__}: a quadrotor needs one that guards its control point; "
                 "take it from make_shield(name, scenario, budget) or shield_of(barrier, scenario)"
@@ -102,7 +102,7 @@ class Pilot(Robot):
             position_noise=sensors.position_noise,
             heading_noise=sensors.heading_noise,
         )
-        self.onboard = Onboard(adapted.inner.scenario, adapted.inner, None, settings)
+        self.onboard = Onboard(inner.scenario, inner, None, settings)
         if isinstance(policy, str) and policy != GOAL_SEEKING:
             policy = load_policy(policy)
         chosen = as_policy(policy, scenario)

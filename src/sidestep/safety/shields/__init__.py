@@ -2,7 +2,15 @@
 
 from sidestep.safety.shields.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.shields.barrier_shield import BarrierShield, shield_of
-from sidestep.safety.shields.catalogue import BARRIERS, SHIELDS, as_shield, make_shield
+from sidestep.safety.shields.catalogue import (
+    BARRIERS,
+    PURSUIT_SHIELDS,
+    SHIELDS,
+    as_shield,
+    checked_shield,
+    make_shield,
+    name_of,
+)
 from sidestep.safety.shields.game import GameMemory, GameShield
 from sidestep.safety.shields.joint import JointShield
 from sidestep.safety.shields.none import NoShield
@@ -11,6 +19,7 @@ from sidestep.safety.shields.shield import Shield, ShieldResult, filter_in_lanes
 
 __all__ = [
     "BARRIERS",
+    "PURSUIT_SHIELDS",
     "SHIELDS",
     "AdaptedShield",
     "BarrierShield",
@@ -22,9 +31,11 @@ __all__ = [
     "Shield",
     "ShieldResult",
     "as_shield",
+    "checked_shield",
     "covered",
     "filter_in_lanes",
     "make_shield",
+    "name_of",
     "of_control_point",
     "shield_of",
     "start_in_lanes",

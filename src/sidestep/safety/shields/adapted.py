@@ -9,7 +9,8 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, lane_by_lane
+from sidestep._arrays import AnyArray, Flag, Scalar, lane_by_lane
+from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.shields.shield import Shield, ShieldResult, filter_in_lanes, start_in_lanes
 from sidestep.world.models import evader_of
 from sidestep.world.robots import body_velocity, wheels_from_body
@@ -77,6 +78,14 @@ class AdaptedShield(Shield):
     inner: Shield
 
     @property
+    def keeps_pursuit_barrier(self) -> bool:  # type: ignore[override]
+        return self.inner.keeps_pursuit_barrier
+
+    @property
+    def unadapted(self) -> Shield:
+        return self.inner
+
+    @property
     def rows_only(self) -> Shield:
         return AdaptedShield(self.scenario, self.inner.rows_only)
 
@@ -95,6 +104,26 @@ class AdaptedShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
         return filter_in_lanes(self.inner, self._seen(world), nominal, memory)
+
+    def rows(self, world: World, memory: Any) -> BarrierRows | None:
+        return self.inner.rows(self._seen(world), memory)
+
+    def filter_by_rows(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
+        return self.inner.filter_by_rows(self._seen(world), nominal, memory)
+
+    def has_plan(self, memory: Any) -> Flag:
+        return self.inner.has_plan(memory)
+
+    def plan(self, world: World, memory: Any) -> Float[Array, "n 2"]:
+        return self.inner.plan(self._seen(world), memory)
+
+    def with_delay(self, delay: Scalar) -> Shield:
+        return AdaptedShield(self.scenario, self.inner.with_delay(delay))
+
+    def with_acceleration(self, acceleration: float) -> Shield:
+        return AdaptedShield(self.scenario, self.inner.with_acceleration(acceleration))
 
     def _seen(self, world: World) -> World:
         world = world_of_control_point(self.scenario, world)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sidestep._arrays import AnyArray, fold, stack
-from sidestep.safety.barriers.barrier import Barrier, BarrierRows, ObstacleBarrier, compose
+from sidestep.safety.barriers.barrier import BarrierRows, ObstacleBarrier, compose
 from sidestep.safety.filter.least_violation import root
 from sidestep.safety.filter.projection import project
 from sidestep.safety.filter.status import Status
@@ -101,10 +101,7 @@ def as_turned(
     )
 
 
-def with_obstacles(
-    barrier: Barrier, scenario: Scenario, world: World, memory: Float[Array, "m *lanes"]
-) -> BarrierRows:
-    """Rows towards all pursuers, then towards all obstacles."""
+def with_obstacles(towards_pursuers: BarrierRows, scenario: Scenario, world: World) -> BarrierRows:
+    """The rows, then those of `ObstacleBarrier` towards all obstacles."""
     obstacle = ObstacleBarrier()
-    towards_pursuers = barrier.rows(scenario, world, memory)
     return compose(towards_pursuers, obstacle.rows(scenario, world, obstacle.remember(scenario, world)))

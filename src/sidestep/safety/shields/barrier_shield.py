@@ -7,7 +7,7 @@ from typing import Any, final
 from jaxtyping import Float
 
 from sidestep._arrays import AnyArray
-from sidestep.safety.barriers.barrier import Barrier, ObstacleBarrier, compose
+from sidestep.safety.barriers.barrier import Barrier, BarrierRows, ObstacleBarrier, compose
 from sidestep.safety.barriers.probe import announce, probe_barrier
 from sidestep.safety.shields.adapted import AdaptedShield, of_control_point
 from sidestep.safety.shields.answer import decide
@@ -39,11 +39,13 @@ class BarrierShield(Shield):
         memory = tuple(
             barrier.remember(scenario, world, sides) for barrier, sides in zip(kept, memory, strict=True)
         )
-        rows = compose(
-            *(barrier.rows(scenario, world, sides) for barrier, sides in zip(kept, memory, strict=True))
-        )
-        hard = scenario.pursuer_count
+        rows, hard = self.rows(world, memory), scenario.pursuer_count
         return decide(scenario, world, nominal, rows, enforced=True, hard=hard), memory
+
+    def rows(self, world: World, memory: Any) -> BarrierRows:
+        kept = self.towards_pursuers, self.towards_obstacles
+        pairs = zip(kept, memory, strict=True)
+        return compose(*(barrier.rows(self.scenario, world, sides) for barrier, sides in pairs))
 
 
 def shield_of(

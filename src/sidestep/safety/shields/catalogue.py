@@ -2,6 +2,9 @@
 
 import dataclasses
 import warnings
+from typing import Any
+
+import equinox as eqx
 
 from sidestep._arrays import traced
 from sidestep.pursuit.game import CaptureGame
@@ -32,8 +35,8 @@ BARRIERS: dict[str, Barrier] = {
     "pursuit, velocity known": PursuitBarrier(known_velocity=True),
 }
 """Every barrier by name."""
-BUDGETED: dict[str, type[GameShield] | type[JointShield]] = {"game": GameShield, "joint": JointShield}
-"""Shields that keep a budget."""
+PURSUIT_SHIELDS = tuple(name for name, kind in SHIELDS.items() if kind.keeps_pursuit_barrier)
+"""Shields whose rows towards pursuers are those of the pursuit barrier. These take a budget."""
 
 
 def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> Shield:
@@ -49,18 +52,21 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS))}")
     if not scenario.built_in:
         guarded = of_control_point(scenario)
-        # The others say nothing of what a pursuer can do.
-        guarded = covered(guarded) if name in BUDGETED else dataclasses.replace(guarded, pursuer_model=None)
-        if name in BUDGETED:
+        if name in PURSUIT_SHIELDS:
+            guarded = covered(guarded)
             _announce_beyond(guarded)
+        else:  # The others say nothing of what a pursuer can do.
+            guarded = dataclasses.replace(guarded, pursuer_model=None)
         return AdaptedShield(scenario, make_shield(name, guarded, budget))
     if budget is not None:
-        if name not in BUDGETED:
-            raise ValueError(f"the shield {name!r} keeps no budget; use 'game' or 'joint'")
+        if name not in PURSUIT_SHIELDS:
+            raise ValueError(
+                f"the shield {name!r} keeps no budget; use {' or '.join(map(repr, PURSUIT_SHIELDS))}"
+            )
         budget.announce(scenario)
     if name == "game":
         return GameShield(scenario, budget, goes_round=True)
-    return SHIELDS[name](scenario) if budget is None else BUDGETED[name](scenario, budget=budget)
+    return JointShield(scenario, budget=budget) if name == "joint" else SHIELDS[name](scenario)
 
 
 def _announce_beyond(guarded: Scenario) -> None:
@@ -85,3 +91,20 @@ def as_shield(shield: str | Shield | Barrier, scenario: Scenario) -> Shield:
     if isinstance(shield, Barrier):
         return shield_of(shield, scenario)
     return make_shield(shield, scenario) if isinstance(shield, str) else shield
+
+
+def checked_shield(shield: Any) -> Shield:
+    """**Raises** `ValueError` for anything but a shield: a name alone does not say for which robots."""
+    if isinstance(shield, Shield):
+        return shield
+    name = shield if isinstance(shield, str) else "joint"
+    raise ValueError(
+        f"shield = {shield!r}: it must be a sidestep.Shield, such as make_shield({name!r}, scenario) with "
+        "the Scenario of the robots in this environment"
+    )
+
+
+def name_of(shield: Shield, scenario: Scenario) -> str | None:
+    """The name under which `make_shield` gives this very shield; None if there is none."""
+    kinds = [name for name, kind in SHIELDS.items() if type(shield) is kind]
+    return next((n for n in kinds if bool(eqx.tree_equal(shield, make_shield(n, scenario)))), None)

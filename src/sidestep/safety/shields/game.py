@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray
-from sidestep.safety.barriers.barrier import BarrierRows, ObstacleBarrier, compose
+from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
 from sidestep.safety.barriers.sampling_margin import guarded, margins, sampling_margin
@@ -55,6 +55,7 @@ class GameShield(Shield):
     Where the scenario has obstacles the memory is then a `GameMemory`, else only its `sides`.
     """
 
+    keeps_pursuit_barrier = True
     scenario: Scenario
     budget: Budget | None = None
     known_velocity: bool = eqx.field(static=True, default=False)
@@ -92,43 +93,62 @@ class GameShield(Shield):
         turn = jnp.where(result.status == Status.INVALID, 0.0, turn)
         return result, GameMemory(sides, turn.astype(memory.turn.dtype))
 
-    def _filtered(
-        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
-    ) -> tuple[ShieldResult, Any]:
+    def rows(self, world: World, memory: Any) -> BarrierRows:
+        return self._rows(world, memory.sides if self._may_be_stuck else memory)
+
+    def _rows(self, world: World, sides: Float[AnyArray, "m *lanes"]) -> BarrierRows:
+        """The rows at the distances that are kept; of a known velocity, two towards each pursuer."""
         if self.known_velocity:
-            return self._over_period(world, nominal, memory)
-        m = self.scenario.pursuer_count
-        rows, memory = self._kept_rows(world, nominal, memory)
+            rows = PursuitBarrier().rows_over_period(self.scenario, world, sides)
+            return with_obstacles(rows, self.scenario, world)
+        kept = guarded(self.scenario, self.budget)
+        rows = with_obstacles(self._barrier.rows(kept, world, sides), kept, world)
+        if self.budget is None:
+            return rows
+        offsets = rows.offsets + self.budget.tracking_error
+        return eqx.tree_at(lambda rows: rows.offsets, rows, offsets)
+
+    @property
+    def _barrier(self) -> PursuitBarrier:
+        # Where the margin has been used up the row still holds what is left, and asks for no more. Not so
+        # with the budget's: errors push inwards again and again, and the row leads back out.
+        return PursuitBarrier(eased=sampling_margin(self.scenario), budget=self.budget)
+
+    def _next_sides(self, world: World, nominal: Any, sides: Any) -> Float[Array, "m *lanes"]:
+        """The sides of the pursuers' axes that the rows follow now."""
+        if self.known_velocity:
+            return PursuitBarrier().remember(self.scenario, world, sides)
+        kept = guarded(self.scenario, self.budget)
+        if self.wish_picks_side:
+            return self._barrier.prefer(kept, world, sides, nominal)
+        return self._barrier.remember(kept, world, sides)
+
+    def _filtered(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], sides: Float[AnyArray, "m *lanes"]
+    ) -> tuple[ShieldResult, Float[Array, "m *lanes"]]:
+        sides, m = self._next_sides(world, nominal, sides), self.scenario.pursuer_count
+        rows = self._rows(world, sides)
+        if self.known_velocity:
+            known = known_parts(world)
+            known = jnp.concatenate([jnp.repeat(known[:m], 2), known[m:]])
+            result = decide(self.scenario, world, nominal, rows, enforced=True, hard=2 * m, known=known)
+            once = jnp.concatenate([result.barriers[: 2 * m : 2], result.barriers[2 * m :]])
+            return eqx.tree_at(lambda result: result.barriers, result, once), sides
         towards_pursuers, towards_obstacles = margins(self.scenario, self.budget)
         values = jnp.concatenate([rows.values[:m] + towards_pursuers, rows.values[m:] + towards_obstacles])
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
-        return decide(self.scenario, world, nominal, rows, enforced=True, hard=m), memory
-
-    def _kept_rows(self, world: World, wish: Any, memory: Any) -> tuple[BarrierRows, Any]:
-        """The rows at the distances that are kept, and the sides of the pursuers' axes that they follow."""
-        # Where the margin has been used up the row still holds what is left, and asks for no more. Not so
-        # with the budget's: errors push inwards again and again, and the row leads back out.
-        barrier = PursuitBarrier(eased=sampling_margin(self.scenario), budget=self.budget)
-        kept = guarded(self.scenario, self.budget)
-        if self.wish_picks_side:
-            memory = barrier.prefer(kept, world, memory, wish)
-        else:
-            memory = barrier.remember(kept, world, memory)
-        rows = with_obstacles(barrier, kept, world, memory)
-        if self.budget is None:
-            return rows, memory
-        offsets = rows.offsets + self.budget.tracking_error
-        return eqx.tree_at(lambda rows: rows.offsets, rows, offsets), memory
+        return decide(self.scenario, world, nominal, rows, enforced=True, hard=m), sides
 
     def heed(
-        self, world: World, wish: Float[Array, "2 *lanes"], memory: Float[Array, "m *lanes"]
+        self, world: World, wish: Float[Array, "2 *lanes"], sides: Float[Array, "m *lanes"]
     ) -> tuple[Float[Array, "2 *lanes"], Float[Array, "m *lanes"]]:
         """The action (m/s) alone, and the next memory, for a finite world and a wish within the speed limit.
 
         The same as calling the shield, without what it takes to be sure of its input and to report: for
         chases that are only imagined.
         """
-        rows, memory = self._kept_rows(world, wish, memory)
+        sides = self._next_sides(world, wish, sides)
+        rows = self._rows(world, sides)
         action = project_known(
             wish,
             rows.normals,
@@ -137,26 +157,4 @@ class GameShield(Shield):
             hard=self.scenario.pursuer_count,
             circle=self.scenario.action == "heading",
         )
-        return action, memory
-
-    def _over_period(
-        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
-    ) -> tuple[ShieldResult, Any]:
-        barrier, obstacle, m = PursuitBarrier(), ObstacleBarrier(), self.scenario.pursuer_count
-        memory = barrier.remember(self.scenario, world, memory)
-        rows = compose(
-            barrier.rows_over_period(self.scenario, world, memory),
-            obstacle.rows(self.scenario, world, obstacle.remember(self.scenario, world)),
-        )
-        known = known_parts(world)
-        result = decide(
-            self.scenario,
-            world,
-            nominal,
-            rows,
-            enforced=True,
-            hard=2 * m,
-            known=jnp.concatenate([jnp.repeat(known[:m], 2), known[m:]]),
-        )
-        once = jnp.concatenate([result.barriers[: 2 * m : 2], result.barriers[2 * m :]])
-        return eqx.tree_at(lambda result: result.barriers, result, once), memory
+        return action, sides

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, final
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, select
 from sidestep.pursuit import Pursuer, make_pursuer, pursue
+from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.sampling_margin import guarded
 from sidestep.safety.filter.status import Status
@@ -29,6 +31,7 @@ from sidestep.safety.shields.look_ahead import (
     wish,
 )
 from sidestep.safety.shields.shield import Shield, ShieldResult
+from sidestep.safety.shields.way_out import way_out
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
@@ -124,6 +127,7 @@ class JointShield(Shield):
     forth costs as much, so what is near remains so up to 1.25 times as far.
     """
 
+    keeps_pursuit_barrier = True
     scenario: Scenario
     pursuer_gain: Scalar = eqx.field(converter=real, default=4.0)
     near_obstacle: Scalar = eqx.field(converter=real, default=0.8)
@@ -172,6 +176,37 @@ class JointShield(Shield):
         turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
         turn = jnp.where(moved_on, 0.0, turn)
         return result, eqx.tree_at(lambda memory: memory.turn, after, turn.astype(memory.turn.dtype))
+
+    def rows(self, world: World, memory: JointMemory) -> BarrierRows:
+        return self._game.rows(world, memory.sides)
+
+    def filter_by_rows(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory
+    ) -> tuple[ShieldResult, JointMemory]:
+        result, sides = self._game(world, nominal, memory.sides)
+        return result, eqx.tree_at(lambda memory: memory.sides, memory, sides)
+
+    def has_plan(self, memory: JointMemory) -> Flag:
+        return memory.counts | (memory.pause > 0.0)
+
+    @eqx.filter_jit
+    def plan(self, world: World, memory: JointMemory) -> Float[Array, "n 2"]:
+        """Where (m) the way out that the shield counts on leads, against a pursuer that plays `nash`."""
+        if not self.scenario.pursuer_count:
+            return super().plan(world, memory)
+        return way_out(
+            self.scenario,
+            self._game.heed,
+            world,
+            memory.sides,
+            memory.way,
+            memory.age,
+            self.horizon,
+            self.acceleration,
+        )
+
+    def with_acceleration(self, acceleration: float) -> JointShield:
+        return dataclasses.replace(self, acceleration=acceleration)
 
     def _filtered(
         self, world: World, nominal: Float[Array, "2"], turn: Scalar, memory: JointMemory
@@ -238,7 +273,6 @@ class JointShield(Shield):
         arrays, fixed = eqx.partition(self, eqx.is_array)
         arrays, situation = jax.lax.stop_gradient((arrays, situation))
         memory = situation.memory
-        known = memory.counts | (memory.pause > 0.0)
         nothing = jnp.zeros_like(memory.pause)
         idle = _Decision(~need, memory.way, memory.age, jnp.zeros((), bool), nothing)
 
@@ -252,7 +286,7 @@ class JointShield(Shield):
         def search(arrays: Any, situation: _Situation) -> _Decision:
             return eqx.combine(arrays, fixed)._search(situation)
 
-        quick = by_need(confirm, need & known, idle, arrays, situation, width=4)
+        quick = by_need(confirm, need & self.has_plan(memory), idle, arrays, situation, width=4)
         seek = ~quick.accept & (quick.pause <= 0.0)
         return by_need(search, seek, quick, arrays, situation, width=1)
 

@@ -34,5 +34,5 @@ class NoShield(Shield):
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
-        rows = with_obstacles(RangeBarrier(), self.scenario, world, memory)
+        rows = with_obstacles(RangeBarrier().rows(self.scenario, world, memory), self.scenario, world)
         return decide(self.scenario, world, nominal, rows, enforced=False, hard=0), memory

@@ -7,7 +7,7 @@ from typing import Any, final
 from jaxtyping import Float
 
 from sidestep._arrays import AnyArray
-from sidestep.safety.barriers.barrier import RangeBarrier
+from sidestep.safety.barriers.barrier import BarrierRows, RangeBarrier
 from sidestep.safety.shields.answer import decide, with_obstacles
 from sidestep.safety.shields.shield import Shield, ShieldResult
 from sidestep.world.scenario import Scenario
@@ -34,6 +34,9 @@ class PaperShield(Shield):
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
-        rows = with_obstacles(RangeBarrier(), self.scenario, world, memory)
         hard = self.scenario.pursuer_count
+        rows = self.rows(world, memory)
         return decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
+
+    def rows(self, world: World, memory: Any) -> BarrierRows:
+        return with_obstacles(RangeBarrier().rows(self.scenario, world, memory), self.scenario, world)

@@ -1,12 +1,14 @@
 """What is a shield? From the action a policy would take to the action a robot may take, with a status."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sidestep._arrays import AnyArray, apart, lane_by_lane
+from sidestep._arrays import AnyArray, Flag, Scalar, apart, lane_by_lane
+from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
@@ -31,10 +33,13 @@ class ShieldResult(eqx.Module):
 class Shield(eqx.Module):
     """A shield for one scenario. `memory = shield.init(world)`; then one call per control period.
 
-    The scenario's gains, speeds and distances are traced: other values never recompile.
+    The scenario's gains, speeds and distances are traced: other values never recompile. What `init` and the
+    call do is a shield's work; all else has an answer here that fits a shield of rows and nothing else.
     """
 
     scenario: eqx.AbstractVar[Scenario]
+    keeps_pursuit_barrier: ClassVar[bool] = False
+    """Whether its rows towards pursuers are those of the `PursuitBarrier`; such a shield takes a budget."""
 
     @property
     def rows_only(self) -> "Shield":
@@ -52,6 +57,11 @@ class Shield(eqx.Module):
         """Whether it takes many worlds in lanes; others are asked for each (`filter_in_lanes`)."""
         return False
 
+    @property
+    def unadapted(self) -> "Shield":
+        """What a shield for custom robots asks: the shield of the evader's control point. Else itself."""
+        return self
+
     @abc.abstractmethod
     def init(self, world: World) -> Any:
         """The memory (a pytree) at the start of an episode."""
@@ -65,6 +75,35 @@ class Shield(eqx.Module):
         **Returns** the `ShieldResult` and the memory for the next call. Non-finite input (a nominal
         action, a pose) gives `Status.INVALID` and an action as close to a stop as the rest allows.
         """
+
+    def rows(self, world: World, memory: Any) -> BarrierRows | None:
+        """The rows that it keeps in this world, towards pursuers first, with the memory that its call
+        returned for it; None for a shield without rows."""
+        return None
+
+    def filter_by_rows(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any]:
+        """As the call, by the rows alone: what a shield that looks ahead does where time is short."""
+        return self(world, nominal, memory)
+
+    def has_plan(self, memory: Any) -> Flag:
+        """Whether it counts on an escape plan now, or follows one, because it has looked ahead."""
+        return jnp.zeros((), bool)
+
+    def plan(self, world: World, memory: Any) -> Float[Array, "n 2"]:
+        """Where (m) its escape plan leads from here; no points for a shield that makes none."""
+        return jnp.zeros((0, 2), world.evader.dtype)
+
+    def with_delay(self, delay: Scalar) -> "Shield":
+        """The same with another `delay` (s) in its budget; itself if it has none."""
+        if getattr(self, "budget", None) is None:
+            return self
+        return eqx.tree_at(lambda shield: shield.budget.delay, self, delay)
+
+    def with_acceleration(self, acceleration: float) -> "Shield":
+        """The same for motors of that much (m/s^2); itself if that makes no difference."""
+        return self
 
 
 def start_in_lanes(shield: Any, world: World) -> Any:

@@ -19,7 +19,7 @@ import sidestep
 from sidestep.learning import LearnedPolicy, load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.rollout import Trajectory, rollout
-from sidestep.safety import SHIELDS, Shield, make_shield
+from sidestep.safety import Shield, make_shield, name_of
 from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.store.files import json_safe
 from sidestep.trials.falsification.attackers import Script
@@ -85,12 +85,7 @@ def play(
 
 def shield_name(shield: str | Shield, scenario: Scenario) -> str:
     """The name under which `make_shield` gives this very shield, else `custom`."""
-    if isinstance(shield, str):
-        return shield
-    for name, kind in SHIELDS.items():
-        if type(shield) is kind and bool(eqx.tree_equal(shield, make_shield(name, scenario))):
-            return name
-    return CUSTOM
+    return shield if isinstance(shield, str) else name_of(shield, scenario) or CUSTOM
 
 
 def policy_digest(policy: LearnedPolicy) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sidestep.loop.rollout import Trajectory
 from sidestep.pursuit import CaptureGame
-from sidestep.safety import Status
+from sidestep.safety import PURSUIT_SHIELDS, Status
 from sidestep.safety.certificate.shield_check import shield_level
 from sidestep.trials.captures import explain_capture
 from sidestep.trials.falsification.attackers import escape_margin
@@ -31,7 +31,6 @@ ASSUMPTIONS: dict[str, str] = {
 }
 """What each shield's guarantee takes for granted, by the names that verdicts use."""
 
-_PURSUIT_SHIELDS = ("game", "joint")
 _ROUNDING = 8.0
 
 
@@ -68,7 +67,7 @@ def judge(
         raise ValueError(f"the episode ended '{outcome}', neither captured nor collided")
     if shield == "none":
         return Verdict("promise", "there is no shield")
-    if shield not in ("paper", *_PURSUIT_SHIELDS):
+    if shield not in ("paper", *PURSUIT_SHIELDS):
         return Verdict("promise", f"nothing is known of what the shield {shield!r} promises")
     common = _before_all_else(scenario, trajectory)
     if common is not None:
@@ -87,7 +86,7 @@ def certified_clearance(scenario: Scenario, shield: str) -> float | None:
     compute: another shield, several pursuers, a pursuer that wins. Takes seconds.
     """
     escapes = bool(CaptureGame.of(scenario).evader_can_escape)
-    if shield not in _PURSUIT_SHIELDS or scenario.pursuer_count != 1 or not escapes:
+    if shield not in PURSUIT_SHIELDS or scenario.pursuer_count != 1 or not escapes:
         return None
     kept = shield_level(scenario)
     return kept.level - kept.error - float(scenario.capture_distance)

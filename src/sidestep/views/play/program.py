@@ -13,21 +13,8 @@ from jaxtyping import Array
 
 from sidestep._arrays import real
 from sidestep.loop.step import control_step, decide
-from sidestep.safety import (
-    GameMemory,
-    GameShield,
-    JointShield,
-    ObstacleBarrier,
-    PaperShield,
-    PursuitBarrier,
-    RangeBarrier,
-    Shield,
-    compose,
-    make_shield,
-)
-from sidestep.safety.barriers.barrier import BarrierRows
-from sidestep.safety.barriers.sampling_margin import guarded, sampling_margin
-from sidestep.safety.shields.way_out import way_out
+from sidestep.safety import BarrierRows, PursuitBarrier, Shield, make_shield
+from sidestep.safety.shields.answer import with_obstacles
 from sidestep.views.play.helm import Helm
 from sidestep.views.play.layout import Layout
 from sidestep.world import Scenario, World
@@ -84,14 +71,12 @@ class Program:
         @jax.jit
         def plan(arrays: Any, numbers: Array, memory: Any) -> Array:
             changed, _, _, world = parts(arrays, numbers, self.given)
-            kept = make_shield(shield, changed)
-            assert isinstance(kept, JointShield)
-            return way_out(kept, world, memory)
+            return make_shield(shield, changed).plan(world, memory)
 
         self.shield = shield
         self._step, self._begin, self._plan = step, begin, plan
         self._dtype = real(0.0).dtype
-        self.plans = shield == "joint" and m > 0 and k > 0
+        self.plans = make_shield(shield, scenario).looks_ahead and m > 0 and k > 0
 
     def vector(self, given: dict[str, Any]) -> np.ndarray:
         """The vector that goes in."""
@@ -162,12 +147,11 @@ def _step(
     moved, memory, events, result, wheels = control_step(scenario, shield, helm, world, memory, nominal, key)
     rows = _rows(scenario, shield, world, memory)
     h = jax.vmap(lambda pose: _level(scenario, world, pose))(world.pursuers)
-    looking = (memory.counts | (memory.pause > 0.0)) if isinstance(shield, JointShield) else 0.0
     parts = {name: getattr(moved, name) for name in World.__annotations__ if name in told.shapes}
     parts |= {name: getattr(events, name) for name in EVENTS}
     parts |= {"nominal": nominal, "action": result.action, "wheels": wheels, "status": result.status}
     parts |= {"barriers": result.barriers, "slack": result.slack, "intervention": result.intervention}
-    parts |= {"h": h, "normals": rows.normals, "offsets": rows.offsets, "looking": looking}
+    parts |= {"h": h, "normals": rows.normals, "offsets": rows.offsets, "looking": shield.has_plan(memory)}
     return told.joined(parts), memory
 
 
@@ -178,19 +162,9 @@ def _level(scenario: Scenario, world: World, pose: Any) -> Array:
 
 
 def _rows(scenario: Scenario, shield: Shield, world: World, memory: Any) -> BarrierRows:
-    """The rows that the shield has just kept, pursuers first; with memory as it left it."""
-    if isinstance(shield, JointShield):
-        shield, memory = shield.rows_only, memory.sides
-    if isinstance(memory, GameMemory):
-        memory = memory.sides
-    barrier, kept = PursuitBarrier(), scenario
-    if isinstance(shield, GameShield):
-        barrier, kept = PursuitBarrier(eased=sampling_margin(scenario)), guarded(shield.scenario)
-    elif isinstance(shield, PaperShield):
-        barrier = RangeBarrier()
-    else:
-        memory = PursuitBarrier().remember(scenario, world)
-    obstacle = ObstacleBarrier()
-    return compose(
-        barrier.rows(kept, world, memory), obstacle.rows(kept, world, obstacle.remember(kept, world))
-    )
+    """The rows that the shield has just kept, with memory as it left it; the game's for a shield without."""
+    rows, barrier = shield.rows(world, memory), PursuitBarrier()
+    if rows is not None:
+        return rows
+    towards_pursuers = barrier.rows(scenario, world, barrier.remember(scenario, world))
+    return with_obstacles(towards_pursuers, scenario, world)
