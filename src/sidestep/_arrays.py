@@ -63,11 +63,11 @@ def fold(operation: Callable[[Any, Any], Any], parts: Array, initial: float | bo
     return functools.reduce(operation, parts)
 
 
-def apart(function: Callable[..., Any], *arguments: Any) -> Any:
-    """`function(*arguments)`, compiled apart from what is around it.
+def no_fuse(function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function(*arguments)`, which XLA does not fuse with the code around it.
 
-    XLA would fuse it with whatever uses its results, and compute it anew for each use. On a CPU that also
-    makes loops so long that they are no longer vectorised.
+    Fused, it would be computed once more for each use of its results. On a CPU the loops also get so long
+    that they are no longer vectorised.
     """
 
     with set_xla_metadata(inlineable="false"):

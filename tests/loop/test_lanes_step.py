@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep._arrays import apart
+from sidestep._arrays import no_fuse
 from sidestep.loop.step import control_step, decide
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import make_shield, start_in_lanes
@@ -62,7 +62,7 @@ def test_what_is_compiled_apart_is_compiled_once():
         return 2.0 * x
 
     for _ in range(3):
-        apart(function, jnp.ones(5))
+        no_fuse(function, jnp.ones(5))
     assert len(traced) == 1
 
 
@@ -71,11 +71,11 @@ def test_compiling_apart_changes_nothing_but_the_program():
         return {"sum": x + pair[0] * jnp.where(x > 0.0, pair[1], 0.0)}
 
     x, pair = jnp.linspace(-1.0, 1.0, 9), (2.0, jnp.asarray(3.0))
-    plain, separate = jax.jit(function), jax.jit(lambda x, pair: apart(function, x, pair))
+    plain, separate = jax.jit(function), jax.jit(lambda x, pair: no_fuse(function, x, pair))
     np.testing.assert_array_equal(plain(x, pair)["sum"], separate(x, pair)["sum"])
-    slope = jax.grad(lambda x: jnp.sum(apart(function, x, pair)["sum"]))
+    slope = jax.grad(lambda x: jnp.sum(no_fuse(function, x, pair)["sum"]))
     np.testing.assert_array_equal(slope(x), jnp.ones_like(x))
     np.testing.assert_array_equal(
-        jax.vmap(lambda x: apart(function, x, pair)["sum"])(x), plain(x, pair)["sum"]
+        jax.vmap(lambda x: no_fuse(function, x, pair)["sum"])(x), plain(x, pair)["sum"]
     )
     assert " call(" in separate.lower(x, pair).compile().as_text()

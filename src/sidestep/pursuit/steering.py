@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sidestep._arrays import AnyArray, Lanes, apart
+from sidestep._arrays import AnyArray, Lanes, no_fuse
 from sidestep.world.robots import wheels_from_body
 
 
@@ -12,7 +12,7 @@ def bearing_of(z: Float[AnyArray, "2 *lanes"]) -> Lanes:
     somewhere = (z[0] != 0.0) | (z[1] != 0.0)
     ahead, left = jnp.where(somewhere, z[0], 1.0), jnp.where(somewhere, z[1], 0.0)
     # Slow, and asked for by either wheel.
-    return apart(jnp.arctan2, left, ahead) if left.ndim else jnp.arctan2(left, ahead)
+    return no_fuse(jnp.arctan2, left, ahead) if left.ndim else jnp.arctan2(left, ahead)
 
 
 def nearer_end(bearing: Float[AnyArray, "*lanes"]) -> tuple[Lanes, Lanes]:

@@ -12,10 +12,10 @@ from sidestep._arrays import (
     Flag,
     Lanes,
     Scalar,
-    apart,
     fold,
     lane_by_lane,
     length,
+    no_fuse,
     norm,
     real,
     stack,
@@ -203,7 +203,7 @@ class Scenario(eqx.Module):
         if self.evader_model is None:
             given = (self, world, velocity, wheels, period)
             # Every event asks for them, and in lanes XLA would compute them anew for each.
-            least = apart(Scenario._approaches, *given) if world.lanes else Scenario._approaches(*given)
+            least = no_fuse(Scenario._approaches, *given) if world.lanes else Scenario._approaches(*given)
             to_pursuers, to_obstacles, to_target = least
         else:
             # One program for all pieces: written out they take long to compile.

@@ -1,4 +1,4 @@
-"""What is a shield? From the action a policy would take to the action a robot may take, with a status."""
+"""What is a shield? It takes a policy's nominal action and gives the action that the robot may take."""
 
 import abc
 from typing import Any, ClassVar
@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sidestep._arrays import AnyArray, Flag, Scalar, apart, lane_by_lane
+from sidestep._arrays import AnyArray, Flag, Scalar, lane_by_lane, no_fuse
 from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
@@ -33,8 +33,8 @@ class ShieldResult(eqx.Module):
 class Shield(eqx.Module):
     """A shield for one scenario. `memory = shield.init(world)`; then one call per control period.
 
-    The scenario's gains, speeds and distances are traced: other values never recompile. What `init` and the
-    call do is a shield's work; all else has an answer here that fits a shield of rows and nothing else.
+    The scenario's gains, speeds and distances are traced: other values never recompile. A custom shield
+    defines `scenario`, `init` and the call. The other answers are those of a shield without a look-ahead.
     """
 
     scenario: eqx.AbstractVar[Scenario]
@@ -43,23 +43,23 @@ class Shield(eqx.Module):
 
     @property
     def rows_only(self) -> "Shield":
-        """The shield to learn through: its rows, whose derivatives say how the executed action follows the
-        nominal one, without anything that is costly and has none. The shield itself if it is all rows."""
+        """The shield to learn through: only the rows, whose derivatives say how the executed action follows
+        the nominal one. A look-ahead is costly and has no derivatives. A shield of rows returns itself."""
         return self
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether it does more than rows, so that a decision costs thousands of times as much."""
+        """Whether it does more than rows. A decision then costs thousands of times as much."""
         return self.rows_only is not self
 
     @property
     def takes_lanes(self) -> bool:
-        """Whether it takes many worlds in lanes; others are asked for each (`filter_in_lanes`)."""
+        """Whether it takes many worlds in lanes; others are called for each world (`filter_in_lanes`)."""
         return False
 
     @property
     def unadapted(self) -> "Shield":
-        """What a shield for custom robots asks: the shield of the evader's control point. Else itself."""
+        """Of a shield for custom robots, the shield of the evader's control point; otherwise itself."""
         return self
 
     @abc.abstractmethod
@@ -72,42 +72,42 @@ class Shield(eqx.Module):
     ) -> tuple[ShieldResult, Any]:
         """Filter the nominal velocity (m/s, world axes).
 
-        **Returns** the `ShieldResult` and the memory for the next call. Non-finite input (a nominal
-        action, a pose) gives `Status.INVALID` and an action as close to a stop as the rest allows.
+        **Returns** the `ShieldResult` and the memory for the next call. Non-finite input (a nominal action, a
+        pose) gives `Status.INVALID` and an action as close to a stop as the other rows allow.
         """
 
     def rows(self, world: World, memory: Any) -> BarrierRows | None:
-        """The rows that it keeps in this world, towards pursuers first, with the memory that its call
-        returned for it; None for a shield without rows."""
+        """The rows that it keeps in this world, towards pursuers first. `memory` is the one that the call for
+        this world returned. None for a shield without rows."""
         return None
 
     def filter_by_rows(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
-        """As the call, by the rows alone: what a shield that looks ahead does where time is short."""
+        """The call without looking ahead, by the rows alone, for a robot that is short of time."""
         return self(world, nominal, memory)
 
     def has_plan(self, memory: Any) -> Flag:
-        """Whether it counts on an escape plan now, or follows one, because it has looked ahead."""
+        """Whether it holds or follows an escape plan now, because it has looked ahead."""
         return jnp.zeros((), bool)
 
     def plan(self, world: World, memory: Any) -> Float[Array, "n 2"]:
-        """Where (m) its escape plan leads from here; no points for a shield that makes none."""
+        """Positions (m) along its escape plan from here on; none for a shield without plans."""
         return jnp.zeros((0, 2), world.evader.dtype)
 
     def with_delay(self, delay: Scalar) -> "Shield":
-        """The same with another `delay` (s) in its budget; itself if it has none."""
+        """The shield with this `delay` (s) in its budget; itself if it has no budget."""
         if getattr(self, "budget", None) is None:
             return self
         return eqx.tree_at(lambda shield: shield.budget.delay, self, delay)
 
     def with_acceleration(self, acceleration: float) -> "Shield":
-        """The same for motors of that much (m/s^2); itself if that makes no difference."""
+        """The shield for motors of that acceleration (m/s^2); itself if it does not depend on it."""
         return self
 
 
 def start_in_lanes(shield: Any, world: World) -> Any:
-    """`shield.init` for one world or for many in lanes, whatever the shield takes."""
+    """`shield.init` for one world, or for many in lanes."""
     if getattr(shield, "takes_lanes", False):
         return shield.init(world)
     return lane_by_lane(shield.init, world.lanes, world)
@@ -116,9 +116,9 @@ def start_in_lanes(shield: Any, world: World) -> Any:
 def filter_in_lanes(
     shield: Any, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
 ) -> tuple[Any, Any]:
-    """The shield's answer for one world or for each of many in lanes, whatever the shield takes."""
+    """The shield's answer for one world, or for each of many in lanes."""
     if not world.lanes:
         return shield(world, nominal, memory)
     if getattr(shield, "takes_lanes", False):
-        return apart(shield, world, nominal, memory)
+        return no_fuse(shield, world, nominal, memory)
     return lane_by_lane(shield, world.lanes, world, nominal, memory)
