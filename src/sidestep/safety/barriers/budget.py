@@ -1,4 +1,4 @@
-"""What measurement, delay and the robot's own motors take from the distances that a shield keeps."""
+"""How much of the distances that a shield keeps do measurement, delay and motors take?"""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from sidestep.world.scenario import Scenario
 
 
 class BudgetWarning(UserWarning):
-    """The budget is more than the game leaves: nothing is guaranteed, and the shield violates it least."""
+    """The budget exceeds what the game allows: there is no guarantee, and the shield violates it least."""
 
 
 class Budget(eqx.Module):
     """Errors that a shield allows for.
 
-    The rows towards pursuers keep, beyond the capture distance l,
+    - `position_error` m, bounds the error of the relative position of evader and another robot
+    - `heading_error` rad, bounds the error of a pursuer's heading
+    - `delay` s, from the time at which a pose was true to the time at which the command based on it acts
+    - `tracking_error` e, m/s, bounds |velocity driven - commanded velocity|
+    - `own_motion_predicted`: the evader's position is advanced by its commands over the delay
 
-        position_error + b rho heading_error + v_e delay (2 v_e delay if the own motion is not predicted),
+    Beyond the capture distance l the rows towards pursuers keep
 
-    since the barrier changes by at most 1 per metre and b rho per radian, and an unseen pursuer lowers it no
-    faster than v_e. The rows towards obstacles keep `position_error` and, if the own motion is not predicted,
-    v_e delay. With a `tracking_error` e the robot drives within e of what it is told: every row asks for e
-    more, and the capture set is that of an evader of speed v_e - e, as long as such an evader can win.
+        position_error + b rho heading_error + v_e delay (2 v_e delay if the own motion is not predicted).
 
-    - `position_error` bounds how far the relative position of evader and another robot is off, m
-    - `heading_error` bounds how far a pursuer's heading is off, rad
-    - `delay` from when a pose was true to when the command decided on it acts, s
-    - `tracking_error` bounds |velocity driven - velocity told|, m/s
-    - `own_motion_predicted`: the evader's position is advanced by its commands over that delay
+    The reason: the barrier changes by at most 1 per metre and b rho per radian, and an unseen pursuer lowers
+    it at v_e at most. The rows towards obstacles keep `position_error`, and v_e delay if the own motion is
+    not predicted. With a tracking error e every row asks for e more, and the capture set is that of an evader
+    of speed v_e - e, if such an evader can win.
 
-    What can be guaranteed with such errors is the certificate's business (`certify`); it also counts that
-    errors hide the side of the pursuer's axis. All numbers are traced: others never recompile.
+    `certify` says what is guaranteed with such errors. It also counts that errors hide the side of the
+    pursuer's axis. All numbers are traced: others never recompile.
     """
 
     position_error: Scalar = eqx.field(converter=real, default=0.0)
@@ -47,7 +47,7 @@ class Budget(eqx.Module):
     own_motion_predicted: bool = eqx.field(static=True, default=True)
 
     def check(self, scenario: Scenario) -> None:
-        """**Raises** `ValueError` for a part that is negative, not finite, or more than the robot has."""
+        """**Raises** `ValueError` for a part that is negative, not finite, or too large."""
         for name in ("position_error", "heading_error", "delay", "tracking_error"):
             value = float(getattr(self, name))
             if not (math.isfinite(value) and value >= 0.0):
@@ -57,7 +57,7 @@ class Budget(eqx.Module):
         if float(self.tracking_error) >= float(scenario.evader_speed):
             raise ValueError(
                 f"budget: tracking_error = {float(self.tracking_error):g} m/s is no less than the evader's "
-                f"speed, {float(scenario.evader_speed):g} m/s: nothing that it is told would count"
+                f"speed, {float(scenario.evader_speed):g} m/s: no command would count"
             )
 
     def towards_pursuers(self, scenario: Scenario) -> Scalar:
@@ -76,30 +76,28 @@ class Budget(eqx.Module):
         return self.position_error + unseen * scenario.evader_speed * self.delay
 
     def sure_speed(self, scenario: Scenario, kept: Scalar) -> Scalar:
-        """The speed (m/s) that the capture set of distance `kept` (m) is built for: v_e - e, or v_e where an
-        evader that slow could not hold it."""
+        """Evader speed (m/s) for the capture set of distance `kept` (m): v_e - e, or v_e where l_max(v_e - e)
+        is less than that distance."""
+        sure, largest = self._sure(scenario)
+        return jnp.where(largest >= kept, sure, scenario.evader_speed)
+
+    def _sure(self, scenario: Scenario) -> tuple[Scalar, Scalar]:
+        """v_e - e (m/s) and l_max(v_e - e) (m)."""
         sure = scenario.evader_speed - self.tracking_error
-        game = eqx.tree_at(
-            lambda g: (g.evader_speed, g.capture_distance), CaptureGame.of(scenario), (sure, kept)
-        )
-        return jnp.where(game.largest_capture_distance >= kept, sure, scenario.evader_speed)
+        game = eqx.tree_at(lambda game: game.evader_speed, CaptureGame.of(scenario), sure)
+        return sure, game.largest_capture_distance
 
     def excess(self, scenario: Scenario) -> Scalar:
-        """By how much (m) l plus the budget is more than l_max(v_e - e); negative where the game leaves room.
+        """By how much (m) l plus the budget exceeds l_max(v_e - e); negative where the game leaves room.
 
-        Sampling and the doubt about sides come on top, see `certify`.
+        Sampling and the doubt about the side come on top, see `certify`.
         """
-        slower = eqx.tree_at(lambda s: s.evader_speed, scenario, scenario.evader_speed - self.tracking_error)
-        return (
-            scenario.capture_distance
-            + self.towards_pursuers(scenario)
-            - CaptureGame.of(slower).largest_capture_distance
-        )
+        return scenario.capture_distance + self.towards_pursuers(scenario) - self._sure(scenario)[1]
 
     def announce(self, scenario: Scenario) -> str | None:
-        """Check the budget and warn if it exceeds what the game allows; returns what the warning says.
+        """Check the budget and warn if it exceeds what the game allows; returns the words of the warning.
 
-        **Raises** as `check`. **Warns** `BudgetWarning`. Silent about traced values, which are not known yet.
+        **Raises** as `check`. **Warns** `BudgetWarning`. Traced values are not checked.
         """
         if traced((self, scenario)):
             return None
