@@ -20,11 +20,11 @@ def claims_of(certificate: Certificate) -> tuple[Claim, ...]:
 
 
 def _stand_ins(certificate: Certificate) -> list[Claim]:
-    told = certificate.situation.stands_for
-    if not told:
+    robots = certificate.situation.stands_for
+    if not robots:
         return []
     text = (
-        f"All of this is about {told}. It holds for the real robots as far as their models keep their words."
+        f"All of this is about {robots}. It holds for the real robots if their models are right about them."
     )
     return [Claim(COMPUTED, text)]
 

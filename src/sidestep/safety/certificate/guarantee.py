@@ -5,11 +5,15 @@ control period from measurements with bounded errors and age. The budget is
 
     l' = l + position + b rho heading + delay + sampling + tracking + sides  <=  l_max,
 
-where `position` and `heading` are what the errors can hide of the barrier (it changes by at most 1 per metre
-and b rho per rad), `delay` is what the pursuer can gain unseen (v_e tau), `sampling` is delta(T) of
-`sampled_design`, `tracking` what more it needs where the motors do not drive quite what they are told, and
-`sides` is what the same computation needs beyond these parts because an evader that
-measures with errors cannot always tell on which side of the pursuer's axis it is.
+with the parts
+
+- `position`, `heading`: what the errors can hide of the barrier, which changes by at most 1 per metre and
+  b rho per rad
+- `delay`: what the pursuer can gain unseen, v_e tau
+- `sampling`: delta(T) of `sampled_design`
+- `tracking`: what the same computation needs in addition if the motors do not drive the commanded velocity
+- `sides`: what it needs beyond these parts, because an evader that measures with errors cannot always tell on
+  which side of the pursuer's axis it is
 """
 
 from __future__ import annotations
@@ -65,17 +69,22 @@ def certify(
 ) -> Certificate:
     """What can be guaranteed for a scenario's robots.
 
-    Of robots of one's own (`EvaderModel`, `PursuerModel`) it is the control point that is spoken of, at
-    distances that are the offset longer, and the differential drive that covers the pursuer.
+    For custom robots (`EvaderModel`, `PursuerModel`) the certificate is about the evader's control point, at
+    distances that are longer by the offset, and about the differential drive that covers the pursuer.
 
-    **Arguments:** `position_error` (m) and `heading_error` (rad) bound every measurement of the pursuer,
-    `delay` (s) is its age; `own_motion_predicted`: the evader adds its own motion since.
-    `tracking_error` (m/s) bounds how far the velocity driven is from the one told. `walls`: the robots are in
-    a bounded arena. `start`: evader in the pursuer's frame (m). `target_distance` (m): asked of where
-    the pursuer wins. `half_axle` and `control_period`: instead of the scenario's; they may be 0 here.
-    `check_shield`: also compute what the shipped `game` shield keeps. `mine`: what can be changed, of
-    `nearest_changes.WHOSE` (evader, sensing, task, pursuer): comes first among the changes that would help,
-    and is tried in pairs. `progress` is told what is computed.
+    **Arguments:**
+
+    - `position_error` m and `heading_error` rad bound every measurement of the pursuer; `delay` s is its age
+    - `own_motion_predicted`: the evader adds its own motion during the delay
+    - `tracking_error` m/s bounds |velocity driven - commanded velocity|
+    - `walls`: the robots are in a bounded arena
+    - `start` m, the evader in the pursuer's frame
+    - `target_distance` m, used where the pursuer wins
+    - `half_axle` m, `control_period` s, in place of the scenario's; they may be 0 here
+    - `check_shield`: also compute what the shipped `game` shield keeps
+    - `mine`: what can be changed, of `nearest_changes.WHOSE` (evader, sensing, task, pursuer). These come
+      first among the changes that would help, and are tried in pairs
+    - `progress` gets, in words, what is computed next
 
     **Raises** `ValueError` naming the argument, its value and what is allowed.
     """

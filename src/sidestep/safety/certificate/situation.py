@@ -24,7 +24,7 @@ class Situation:
     obstacle_gain: float = 0.0
     walls: bool = False
     stands_for: str = ""
-    """What robots of one's own these are to speak for, in words; empty for the built-in ones."""
+    """The custom robots that these stand for, in words; empty for the built-in ones."""
 
 
 def plain(value: Any) -> float:
@@ -37,9 +37,9 @@ def situation_of(
 ) -> Situation:
     """A scenario's situation with exact measurements; `half_axle` and `control_period` replace its own.
 
-    With robots of one's own it is that of the evader's control point and the drive that covers the pursuer.
-    **Raises** `ValueError` where the pursuer's model names none, or for a `half_axle` of a pursuer that has
-    none of its own.
+    For custom robots it is that of the evader's control point and of the drive that covers the pursuer.
+    **Raises** `ValueError` where the pursuer's model names no such drive, or for a `half_axle` together with
+    a pursuer's model.
     """
     stands_for = _stands_for(scenario)
     if half_axle is not None and scenario.pursuer_model is not None:
@@ -69,17 +69,17 @@ def situation_of(
 
 
 def _stands_for(scenario: Scenario) -> str:
-    evader, pursuer, told = scenario.evader_model, scenario.pursuer_model, []
+    evader, pursuer, words = scenario.evader_model, scenario.pursuer_model, []
     if evader is not None:
-        told.append(
+        words.append(
             f"the control point of a {type(evader).__name__} in the evader's place, which is never more than "
             f"{plain(evader.offset(scenario)):.4g} m from it and so keeps as much more"
         )
     if pursuer is not None:
         drive = covered(scenario)
-        told.append(
+        words.append(
             f"a differential drive (V = {plain(drive.pursuer_speed):.4g} m/s, b = "
             f"{plain(drive.pursuer_half_axle):.4g} m) in the pursuer's, which can do all that this "
             f"{type(pursuer).__name__} can"
         )
-    return ", and ".join(told)
+    return ", and ".join(words)
