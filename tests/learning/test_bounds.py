@@ -136,7 +136,7 @@ def test_joint_is_learned_through_by_its_rows_alone():
     scenario = load_scenario("paper")
     joint = JointShield(scenario)
     faster = eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain)
-    rows = GameShield(faster, wish_picks_side=True)
+    rows = GameShield(faster, nominal_picks_side=True)
     worlds, actions = crowded_worlds(2, 6), actions_of(2, 7)
     ours, theirs = (
         jax.make_jaxpr(lambda w, a, s=shield: through_shield(scenario, s, w)(a, KEY))(worlds, actions)

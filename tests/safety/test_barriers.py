@@ -62,7 +62,7 @@ def test_analytic_automatic_and_numeric_gradients_agree(x64, name):
     @jax.jit
     @jax.vmap
     def check(world):
-        memory = barrier.remember(scenario, world)
+        memory = barrier.update_memories(scenario, world)
 
         def one(robot, side):
             value = lambda point: barrier.value(scenario, point, robot, side)  # noqa: E731
@@ -70,7 +70,7 @@ def test_analytic_automatic_and_numeric_gradients_agree(x64, name):
             axes = h * jnp.eye(2)
             numeric = jax.vmap(lambda d: (value(world.evader + d) - value(world.evader - d)) / (2 * h))(axes)
             return (
-                barrier.approach(scenario, world.evader, robot, side)[0],
+                barrier.gradient_and_rate(scenario, world.evader, robot, side)[0],
                 jax.grad(value)(world.evader),
                 numeric,
             )
@@ -91,7 +91,7 @@ def test_the_row_is_the_derivative_along_true_motion(x64, name):
     @jax.jit
     @jax.vmap
     def check(world, velocity):
-        memory = barrier.remember(scenario, world)
+        memory = barrier.update_memories(scenario, world)
         rows = barrier.rows(scenario, world, memory)
 
         def rate(robot, side):
@@ -100,7 +100,7 @@ def test_the_row_is_the_derivative_along_true_motion(x64, name):
                 return barrier.value(scenario, world.evader + t * velocity, moved, side)
 
             h = jnp.asarray(1e-6)
-            return (later(h) - later(-h)) / (2 * h), barrier.allowance(scenario, later(0.0 * h))
+            return (later(h) - later(-h)) / (2 * h), barrier.alpha(scenario, later(0.0 * h))
 
         derivative, allowance = jax.vmap(rate)(barrier.robots(world), memory)
         return derivative + allowance, rows.normals @ velocity - rows.offsets
@@ -119,7 +119,7 @@ def test_rows_are_ordered_like_their_robots_and_every_count_works(precision, nam
     row = jax.jit(functools.partial(barrier.row, scenario))
     for pursuers, obstacles in ((1, 0), (2, 3)):
         world = jax.tree.map(lambda v: v[0], _worlds(1, obstacles=obstacles, pursuers=pursuers))
-        memory = jax.jit(barrier.remember)(scenario, world)
+        memory = jax.jit(barrier.update_memories)(scenario, world)
         rows = jax.jit(barrier.rows)(scenario, world, memory)
         robots = barrier.robots(world)
         assert rows.values.shape == (len(robots),) == memory.shape
@@ -139,7 +139,7 @@ def test_never_nan_on_top_of_the_other_robot_or_on_its_axis(precision, name):
     for place in ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (1e-30, 0.0)):
         robot = jnp.zeros(size).at[:2].set(jnp.asarray(place, float))
         for side in (-1.0, 0.0, 1.0):
-            memory = barrier.recall(scenario, evader, robot, jnp.asarray(side))
+            memory = barrier.update_memory(scenario, evader, robot, jnp.asarray(side))
             value, normal, offset = barrier.row(scenario, evader, robot, memory)
             gradient = jax.grad(lambda p, r=robot, m=memory: barrier.value(scenario, p, r, m))(evader)
             for entry in (value, normal, offset, gradient, memory):
@@ -151,7 +151,8 @@ def test_composition_demands_every_row_and_its_value_is_the_least(precision):
     scenario = load_scenario("paper")
     world = jax.tree.map(lambda v: v[0], _worlds(1))
     parts = [
-        b.rows(scenario, world, b.remember(scenario, world)) for b in (RangeBarrier(), ObstacleBarrier())
+        b.rows(scenario, world, b.update_memories(scenario, world))
+        for b in (RangeBarrier(), ObstacleBarrier())
     ]
     whole = compose(*parts)
     assert whole.values.shape == (4,)
@@ -212,7 +213,7 @@ def test_a_feasible_row_everywhere_outside_the_capture_set_whatever_the_gain(x64
     @jax.jit
     @jax.vmap
     def row(z, side):
-        memory = barrier.recall(scenario, z, jnp.zeros(3), side)
+        memory = barrier.update_memory(scenario, z, jnp.zeros(3), side)
         return *barrier.row(scenario, z, jnp.zeros(3), memory), barrier.value(
             scenario, z, jnp.zeros(3), jnp.sign(z[1])
         )
@@ -244,8 +245,8 @@ def test_no_admissible_wheel_speeds_beat_the_row(x64, parameters):
     @jax.vmap
     def check(z, side):
         pose = jnp.zeros(3)
-        memory = barrier.recall(scenario, z, pose, side)
-        _, rate = barrier.approach(scenario, z, pose, memory)
+        memory = barrier.update_memory(scenario, z, pose, side)
+        _, rate = barrier.gradient_and_rate(scenario, z, pose, memory)
 
         def lowered(wheel):
             later = lambda t: barrier.value(  # noqa: E731
@@ -268,7 +269,7 @@ def test_left_right_and_front_rear_are_alike(x64):
     row = jax.jit(
         jax.vmap(
             lambda z, side: barrier.row(
-                scenario, z, jnp.zeros(3), barrier.recall(scenario, z, jnp.zeros(3), side)
+                scenario, z, jnp.zeros(3), barrier.update_memory(scenario, z, jnp.zeros(3), side)
             )
         )
     )
@@ -300,7 +301,7 @@ def test_rows_turn_with_the_world(x64):
         ),
     )
     for barrier in BARRIERS.values():
-        rows = jax.vmap(lambda w, b=barrier: b.rows(scenario, w, b.remember(scenario, w)))
+        rows = jax.vmap(lambda w, b=barrier: b.rows(scenario, w, b.update_memories(scenario, w)))
         a, b = rows(worlds), rows(turned)
         np.testing.assert_allclose(b.values, a.values, atol=1e-9)
         np.testing.assert_allclose(b.normals, a.normals @ turn.T, atol=1e-9)
@@ -317,20 +318,20 @@ def test_a_side_is_kept_across_the_axis_and_left_within_the_overlap(x64):
         y = -share * margin * np.cos(usable)
         x = (0.15 - y * np.sin(usable)) / np.cos(usable)  # on the left tangent, h_left = 0
         for front in (1.0, -1.0):
-            memory = barrier.recall(scenario, jnp.array([front * x, y]), jnp.zeros(3), jnp.ones(()))
+            memory = barrier.update_memory(scenario, jnp.array([front * x, y]), jnp.zeros(3), jnp.ones(()))
             assert memory == (1.0 if kept or y >= 0.0 else -1.0)
     # Beside the pursuer there is only one normal, and the side is simply the evader's own.
-    assert barrier.recall(scenario, jnp.array([0.0, -0.5]), jnp.zeros(3), jnp.ones(())) == -1.0
-    assert barrier.recall(scenario, jnp.array([0.5, -0.1]), jnp.zeros(3), None) == -1.0
+    assert barrier.update_memory(scenario, jnp.array([0.0, -0.5]), jnp.zeros(3), jnp.ones(())) == -1.0
+    assert barrier.update_memory(scenario, jnp.array([0.5, -0.1]), jnp.zeros(3), None) == -1.0
 
 
 def test_a_lost_evader_still_commits_to_one_side(x64):
     """Inside the capture set no row holds; changing sides at each crossing would make it worse."""
     scenario, barrier = load_scenario("paper"), PursuitBarrier()
-    assert barrier.recall(scenario, jnp.array([0.24, -0.001]), jnp.zeros(3), jnp.ones(())) == 1.0
+    assert barrier.update_memory(scenario, jnp.array([0.24, -0.001]), jnp.zeros(3), jnp.ones(())) == 1.0
     hopeless = load_scenario("paper", capture_distance=0.3)
-    assert barrier.recall(hopeless, jnp.array([0.4, -0.001]), jnp.zeros(3), jnp.ones(())) == 1.0
-    assert barrier.recall(hopeless, jnp.array([0.4, -0.1]), jnp.zeros(3), jnp.ones(())) == -1.0
+    assert barrier.update_memory(hopeless, jnp.array([0.4, -0.001]), jnp.zeros(3), jnp.ones(())) == 1.0
+    assert barrier.update_memory(hopeless, jnp.array([0.4, -0.1]), jnp.zeros(3), jnp.ones(())) == -1.0
 
 
 @pytest.mark.parametrize("parameters", [{"capture_distance": 0.25}, {"evader_speed": 0.1}])
@@ -351,7 +352,7 @@ def test_the_allowance_grows_with_h_from_zero(x64):
         for gain in (0.0, 0.3, 5.0):
             scenario = load_scenario("paper", pursuer_gain=gain, obstacle_gain=gain, **parameters)
             for barrier in BARRIERS.values():
-                allowance = jax.vmap(functools.partial(barrier.allowance, scenario))
+                allowance = jax.vmap(functools.partial(barrier.alpha, scenario))
                 assert allowance(jnp.zeros(1))[0] == 0.0
                 assert np.all(np.diff(allowance(jnp.linspace(-0.1, 3.0, 200))) >= 0.0)
                 np.testing.assert_allclose(allowance(jnp.array([-0.1]))[0], -0.1 * gain, atol=1e-12)

@@ -10,7 +10,8 @@ from sidestep._arrays import real
 from sidestep.loop.keys import episode_key, start_and_pursuit
 from sidestep.pursuit import make_pursuer, pursue
 from sidestep.safety import Budget, GameShield, JointShield, PursuitBarrier, Status, make_shield
-from sidestep.safety.shields.look_ahead import STRETCHES, WISHES, imagine, ramp, stretch, wish
+from sidestep.safety.shields.escape_plan import CHOICES, SEGMENTS, choice_at, chosen_velocity
+from sidestep.safety.shields.look_ahead import imagine, ramp
 from sidestep.world import World, load_scenario
 
 # Of the first 300 random starts from key 7, some in which `game` collides while heading for the target.
@@ -79,7 +80,7 @@ def test_an_imagined_chase_is_the_chase_that_follows(acceleration):
     scenario = load_scenario("paper", obstacle_count=2)
     names = ("pure-pursuit", "interceptor")
     models = tuple(make_pursuer(name) for name in names)
-    guard = GameShield(scenario, wish_picks_side=True)
+    guard = GameShield(scenario, nominal_picks_side=True)
     world = scenario.reset(jax.random.key(4))
     ways = jnp.array([[0, 5, 16, 18], [17, 17, 3, 19]], jnp.int32)
     ages, length = jnp.array([0.0, 0.2]), jnp.asarray(0.5)
@@ -103,7 +104,8 @@ def test_an_imagined_chase_is_the_chase_that_follows(acceleration):
         sides = guard.init(world)
         spread = lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, 2, 2))  # noqa: E731
         outlook = imagine(
-            scenario, guard.heed, models, jax.tree.map(spread, world), spread(sides), ways, ages, length, 30,
+            scenario, guard.filter_unchecked, models, jax.tree.map(spread, world), spread(sides), ways, ages,
+            length, 30,
             None if acceleration is None else real(acceleration),
         )  # fmt: skip
 
@@ -111,8 +113,8 @@ def test_an_imagined_chase_is_the_chase_that_follows(acceleration):
             def step(carry, index):
                 world, sides, velocity = carry
                 now = age + index.astype(age.dtype) * scenario.control_period
-                wished = wish(scenario, world, sides, stretch(way, now, length))
-                result, sides = guard(world, wished, sides)
+                nominal = chosen_velocity(scenario, world, sides, choice_at(way, now, length))
+                result, sides = guard(world, nominal, sides)
                 driven, velocity = motors(velocity, result.action)
                 world, _ = scenario.step(world, driven, pursue(scenario, model, world, jax.random.key(0)))
                 world = eqx.tree_at(lambda world: world.evader_velocity, world, velocity)
@@ -143,12 +145,12 @@ def test_the_time_to_contact_counts_until_the_first_touch():
     world = World(
         jnp.zeros(2), jnp.array([[30.0, 0.0, 0.0]]), jnp.array([[0.5, 0.0, 0.0, 0.0]]), jnp.array([2.0, 0.0])
     )
-    free = lambda world, wished, sides: (wished, sides)  # noqa: E731
+    free = lambda world, nominal, sides: (nominal, sides)  # noqa: E731
     spread = lambda leaf: leaf[..., None, None]  # noqa: E731
     outlook = jax.jit(
         lambda world: imagine(
             scenario, free, (make_pursuer("still"),), jax.tree.map(spread, world), spread(jnp.ones(1)),
-            jnp.zeros((1, STRETCHES), jnp.int32), jnp.zeros(1), jnp.asarray(1.5), 60,
+            jnp.zeros((1, SEGMENTS), jnp.int32), jnp.zeros(1), jnp.asarray(1.5), 60,
         )
     )(world)  # fmt: skip
     assert float(outlook.time[0, 0]) == pytest.approx(1.9, abs=0.11)
@@ -197,7 +199,7 @@ def test_whatever_is_driven_has_passed_the_pursuers_row(decided):
     np.testing.assert_allclose(result.intervention, changed, atol=1e-6)
     assert np.all(np.asarray(result.status)[changed > 1e-4] != Status.OK)
     # The look-ahead has something to say here, or the tests of this file would be about `game`.
-    assert np.mean(np.asarray(memory.way) != WISHES - 1) > 0.2
+    assert np.mean(np.asarray(memory.plan) != CHOICES - 1) > 0.2
 
 
 @pytest.mark.slow
@@ -226,8 +228,8 @@ def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_whi
     period = float(scenario.control_period)
     waits = np.asarray(before.pause) > 1e-6
     assert 5 <= waits.sum() < len(waits)
-    assert not np.any(np.asarray(before.counts)[waits])
-    same = np.all(np.asarray(before.way == after.way), axis=-1)
+    assert not np.any(np.asarray(before.clear)[waits])
+    same = np.all(np.asarray(before.plan == after.plan), axis=-1)
     left = np.asarray(before.pause - after.pause)
     # Either the pause goes on with the same way, or it is over: something else was found, or nobody is near.
     goes_on = waits & np.isclose(left, period, atol=1e-5)
@@ -237,7 +239,7 @@ def test_where_no_way_keeps_the_margin_one_without_contact_is_followed_for_a_whi
 
 
 def test_an_action_is_accepted_only_if_what_it_leads_to_is_clear():
-    """The period in which the action itself is driven counts, not only the way out after it."""
+    """The period in which the action itself is driven counts, not only the escape plan after it."""
     scenario = load_scenario("paper", obstacle_gain=3.0)
     shield = JointShield(scenario, models=("turn-then-drive",))
     away, act = np.pi / 8.0 * 3.0, eqx.filter_jit(shield)
@@ -252,9 +254,9 @@ def test_an_action_is_accepted_only_if_what_it_leads_to_is_clear():
         )
         # The way out makes good in its first period what the action, straight at the obstacle, loses.
         memory = eqx.tree_at(
-            lambda m: (m.counts, m.way),
+            lambda m: (m.clear, m.plan),
             shield.init(world),
-            (jnp.asarray(True), jnp.full(STRETCHES, 3, jnp.int32)),
+            (jnp.asarray(True), jnp.full(SEGMENTS, 3, jnp.int32)),
         )
         greedy, _ = eqx.filter_jit(shield.rows_only)(world, 0.157 * ahead, memory.sides)
         lost = 0.05 * float(greedy.action @ ahead)
@@ -271,7 +273,7 @@ def test_alone_a_robot_decides_as_it_does_in_a_batch(decided):
         alone, kept = act(world, nominal[index])
         np.testing.assert_allclose(alone.action, result.action[index], atol=2e-6)
         assert int(alone.status) == int(result.status[index])
-        np.testing.assert_array_equal(kept.way, memory.way[index])
+        np.testing.assert_array_equal(kept.plan, memory.plan[index])
 
 
 @pytest.mark.slow
@@ -282,7 +284,7 @@ def test_far_away_and_without_obstacles_it_is_the_game_shield():
         )
         joint = JointShield(scenario, models=("turn-then-drive",))
         faster = eqx.tree_at(lambda s: s.pursuer_gain, scenario, joint.pursuer_gain)
-        game = GameShield(faster, wish_picks_side=True)
+        game = GameShield(faster, nominal_picks_side=True)
         world = World(
             jnp.zeros(2),
             jnp.array([[0.27, 0.02, 3.0]]),
@@ -294,7 +296,7 @@ def test_far_away_and_without_obstacles_it_is_the_game_shield():
         theirs, _ = eqx.filter_jit(game)(world, nominal, game.init(world))
         np.testing.assert_allclose(ours.action, theirs.action, atol=1e-7)
         assert ours.status == theirs.status == Status.CORRECTED
-        assert not memory.counts
+        assert not memory.clear
 
 
 def test_a_pursuer_that_drives_as_a_model_does_is_recognised():
@@ -318,13 +320,13 @@ def test_a_pursuer_that_drives_as_a_model_does_is_recognised():
     assert surprise["turn-then-drive"] > 0.1
 
 
-def test_close_to_the_axis_the_wish_picks_the_side_and_farther_off_it_does_not():
+def test_close_to_the_axis_the_nominal_action_picks_the_side_and_farther_off_it_does_not():
     """Without that a pursuer that keeps turning after the evader leads it round to one side for ever."""
     scenario = load_scenario("paper", pursuer_gain=4.0)
     barrier = PursuitBarrier()
     pick = jax.jit(
-        lambda place, wish, side: barrier.prefer(
-            scenario, World(place, jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.zeros(2)), side[None], wish
+        lambda place, nominal, side: barrier.choose_sides(
+            scenario, World(place, jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.zeros(2)), side[None], nominal
         )[0]
     )
     left, right = jnp.array([0.05, 0.1]), jnp.array([0.05, -0.1])
@@ -333,7 +335,7 @@ def test_close_to_the_axis_the_wish_picks_the_side_and_farther_off_it_does_not()
         assert pick(near, left, side) == 1.0
         assert pick(near, right, side) == -1.0
         # Straight on decides nothing.
-        assert pick(near, jnp.array([0.15, 0.001]), side) == barrier.recall(
+        assert pick(near, jnp.array([0.15, 0.001]), side) == barrier.update_memory(
             scenario, near, jnp.zeros(3), side
         )
         # At the tip of the capture set, or far to one side, only the evader's own side can be kept.
@@ -343,7 +345,7 @@ def test_close_to_the_axis_the_wish_picks_the_side_and_farther_off_it_does_not()
 
 def test_who_has_used_up_what_is_kept_beyond_the_distance_does_not_change_to_a_side_that_is_lost():
     """Close to the axis and outside the capture set by less than the margin, the falsifier found a
-    `joint` that followed the wish across and gave away a millimetre."""
+    `joint` that followed the nominal action across and gave away a millimetre."""
     scenario = load_scenario("paper")
     angle, capture = float(scenario.usable_angle), float(scenario.capture_distance)
     rng = np.random.default_rng(0)
@@ -356,7 +358,7 @@ def test_who_has_used_up_what_is_kept_beyond_the_distance_does_not_change_to_a_s
 
         def answer(place, other, shield=shield):
             world = World(place, jnp.zeros((1, 3)), jnp.zeros((0, 4)), jnp.zeros(2))
-            # It remembers the other side, and wishes to go there.
+            # It remembers the other side, and wants to go there.
             result, memory = shield(
                 world, scenario.evader_speed * jnp.stack([0.0 * other, other]), other[None]
             )
@@ -415,8 +417,8 @@ def _at_the_axis(count, seed):
 @pytest.mark.parametrize(
     "acceleration, depends", [(None, True), pytest.param(2.0, False, marks=pytest.mark.slow)]
 )
-def test_a_wish_that_is_not_driven_changes_no_side_of_a_robot_with_motors(acceleration, depends):
-    """Where nothing is clear the way that touches last is driven, and that is no matter of the wish."""
+def test_an_action_that_is_not_driven_changes_no_side_of_a_robot_with_motors(acceleration, depends):
+    """Where nothing is clear the plan that touches last is driven, whatever the nominal action."""
     scenario = load_scenario("paper-test")
     budget = Budget(position_error=0.002, heading_error=0.002, delay=0.02)
     shield = JointShield(scenario, budget=budget, acceleration=acceleration)
@@ -428,7 +430,7 @@ def test_a_wish_that_is_not_driven_changes_no_side_of_a_robot_with_motors(accele
         memory = shield.init(world)
         result, after = shield(world, nominal, memory)
         through, _ = shield.rows_only(world, nominal, memory.sides)
-        rejected = ~after.counts & jnp.any(jnp.abs(result.action - through.action) > 1e-6)
+        rejected = ~after.clear & jnp.any(jnp.abs(result.action - through.action) > 1e-6)
         return result.action, rejected
 
     one, other = ask(worlds, left), ask(worlds, -left)

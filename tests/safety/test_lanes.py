@@ -61,7 +61,7 @@ def test_shield_and_its_short_form(fields):
     result = eqx.filter_jit(shield.__call__)(_in_lanes(worlds), _in_lanes(wish), _in_lanes(memory))
     _close(result, expected)
     assert np.sum(np.asarray(expected[0].status) == Status.CORRECTED) >= 2
-    short = eqx.filter_jit(shield.heed)(_in_lanes(worlds), _in_lanes(wish), _in_lanes(memory))
+    short = eqx.filter_jit(shield.filter_unchecked)(_in_lanes(worlds), _in_lanes(wish), _in_lanes(memory))
     _close(short, (expected[0].action, expected[1]))
 
 

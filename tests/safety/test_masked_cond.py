@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.safety.shields.by_need import by_need
+from sidestep.safety.shields.masked_cond import masked_cond
 
 
 def _work(place, pair):
@@ -14,7 +14,7 @@ def _work(place, pair):
 
 def _ask(need, place, pair, width=4):
     otherwise = {"sum": jnp.full((), -1.0), "which": jnp.full((), -1, jnp.int32)}
-    return by_need(_work, need, otherwise, place, pair, width=width)
+    return masked_cond(_work, need, otherwise, place, pair, width=width)
 
 
 def _batch(size, seed=0):
@@ -78,7 +78,7 @@ def test_the_cost_follows_the_number_in_need(needed):
         return value * 2.0
 
     def ask(need, value):
-        return by_need(work, need, jnp.zeros_like(value), value, width=4)
+        return masked_cond(work, need, jnp.zeros_like(value), value, width=4)
 
     need = jnp.arange(40) < needed
     answer = jax.jit(jax.vmap(ask))(need, jnp.arange(40.0))

@@ -1,4 +1,4 @@
-"""Barriers and shields for robots of one's own: what is refused, what is doubted, what is kept."""
+"""Barriers and shields for custom robots: what is refused, what is doubted, what is kept."""
 
 import dataclasses
 import math
@@ -19,6 +19,7 @@ from sidestep.safety import (
     BarrierWarning,
     DistanceValue,
     FrameBarrier,
+    GameShield,
     ObstacleBarrier,
     PursuitBarrier,
     RangeBarrier,
@@ -72,29 +73,29 @@ class _Steady(Barrier):
     def value(self, scenario, evader, robot, memory):
         return RangeBarrier().value(scenario, evader, robot, memory)
 
-    def approach(self, scenario, evader, robot, memory):
-        return RangeBarrier().approach(scenario, evader, robot, memory)
+    def gradient_and_rate(self, scenario, evader, robot, memory):
+        return RangeBarrier().gradient_and_rate(scenario, evader, robot, memory)
 
-    def allowance(self, scenario, h):
+    def alpha(self, scenario, h):
         return 1.2 * h
 
-    def recall(self, scenario, evader, robot, memory):
+    def update_memory(self, scenario, evader, robot, memory):
         return jnp.zeros(())
 
 
-class _AllowanceAtZero(_Steady):
-    def allowance(self, scenario, h):
+class _AlphaAtZero(_Steady):
+    def alpha(self, scenario, h):
         return 0.05 + 1.2 * h
 
 
-class _FallingAllowance(_Steady):
-    def allowance(self, scenario, h):
+class _FallingAlpha(_Steady):
+    def alpha(self, scenario, h):
         return h * (0.3 - h)
 
 
 class _TurnedNormal(_Steady):
-    def approach(self, scenario, evader, robot, memory):
-        normal, rate = super().approach(scenario, evader, robot, memory)
+    def gradient_and_rate(self, scenario, evader, robot, memory):
+        normal, rate = super().gradient_and_rate(scenario, evader, robot, memory)
         return -normal, rate
 
 
@@ -104,7 +105,7 @@ class _NoHold(_Steady):
     def value(self, scenario, evader, robot, memory):
         return 0.01 * jnp.cos(robot[2])
 
-    def approach(self, scenario, evader, robot, memory):
+    def gradient_and_rate(self, scenario, evader, robot, memory):
         return jnp.zeros(2), jnp.zeros(())
 
 
@@ -117,8 +118,8 @@ class _WrongUnits(_Steady):
     def value(self, scenario, evader, robot, memory):
         return 1000.0 * super().value(scenario, evader, robot, memory) + 500.0
 
-    def approach(self, scenario, evader, robot, memory):
-        normal, rate = super().approach(scenario, evader, robot, memory)
+    def gradient_and_rate(self, scenario, evader, robot, memory):
+        normal, rate = super().gradient_and_rate(scenario, evader, robot, memory)
         return 1000.0 * normal, 1000.0 * rate
 
 
@@ -126,8 +127,8 @@ class _Reversed(_Steady):
     def value(self, scenario, evader, robot, memory):
         return -super().value(scenario, evader, robot, memory)
 
-    def approach(self, scenario, evader, robot, memory):
-        normal, rate = super().approach(scenario, evader, robot, memory)
+    def gradient_and_rate(self, scenario, evader, robot, memory):
+        normal, rate = super().gradient_and_rate(scenario, evader, robot, memory)
         return -normal, -rate
 
 
@@ -137,12 +138,12 @@ class _Vector(_Steady):
 
 
 class _NoRate(_Steady):
-    def approach(self, scenario, evader, robot, memory):
-        return super().approach(scenario, evader, robot, memory)[0]
+    def gradient_and_rate(self, scenario, evader, robot, memory):
+        return super().gradient_and_rate(scenario, evader, robot, memory)[0]
 
 
 class _Typo(_Steady):
-    def allowance(self, scenario, h):
+    def alpha(self, scenario, h):
         return scenario.pursuer_gian * h
 
 
@@ -154,8 +155,8 @@ class _OneRobot(_Steady):
 @pytest.mark.parametrize(
     "barrier, words",
     [
-        (_AllowanceAtZero(), r"allowance\(0\) = 0\.05 m/s: it must be 0"),
-        (_FallingAllowance(), "does not increase with h"),
+        (_AlphaAtZero(), r"alpha\(0\) = 0\.05 m/s: it must be 0"),
+        (_FallingAlpha(), "does not increase with h"),
         (_TurnedNormal(), "the normal is not the gradient"),
         (_NoHold(), r"relative degree above 1"),
         (_NotFinite(), r"h, .*not finite, for instance with the evader at"),
@@ -163,7 +164,7 @@ class _OneRobot(_Steady):
         (_Reversed(), "is its sign turned round"),
         (_Vector(), r"value\(scenario, evader, robot, memory\) must give one number.*\(2,\)"),
         (_NoRate(), r"must give \(normal \(2,\), rate \(\)\)"),
-        (_Typo(), r"allowance\(scenario, h\) raised AttributeError"),
+        (_Typo(), r"alpha\(scenario, h\) raised AttributeError"),
         (_OneRobot(), r"one row of numbers for each robot"),
     ],
     ids=lambda value: type(value).__name__,
@@ -182,8 +183,10 @@ def test_value_alone_gives_the_certified_row():
     poses = jnp.asarray(rng.uniform(-1.0, 1.0, (256, 3)) * np.array([1.0, 1.0, np.pi]), float)
 
     def row(barrier, evader, pose):
-        memory = barrier.recall(scenario, evader, pose, None)
-        return barrier.value(scenario, evader, pose, memory), barrier.approach(scenario, evader, pose, memory)
+        memory = barrier.update_memory(scenario, evader, pose, None)
+        return barrier.value(scenario, evader, pose, memory), barrier.gradient_and_rate(
+            scenario, evader, pose, memory
+        )
 
     (h, (normal, rate)), (expected, (expected_normal, expected_rate)) = (
         eqx.filter_jit(jax.vmap(lambda evader, pose, b=barrier: row(b, evader, pose)))(evaders, poses)
@@ -296,3 +299,50 @@ def test_grid_barrier_is_refused_where_the_pursuer_wins():
 def test_grid_that_cannot_be_solved_on(options, words):
     with pytest.raises(ValueError, match=words):
         solve_distance(load_scenario("paper"), **options)
+
+
+def test_a_barrier_with_the_old_names_still_works_and_says_so():
+    """The names of before are those that custom barriers override; they go with the next release."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+
+        class Old(_Steady):
+            def approach(self, scenario, evader, robot, memory):
+                normal, rate = super().approach(scenario, evader, robot, memory)
+                return normal, rate + 0.01
+
+            def allowance(self, scenario, h):
+                return 2.0 * h
+
+            def recall(self, scenario, evader, robot, memory):
+                return jnp.ones(())
+
+    assert str(told[1].message) == "Old.allowance is alpha now; the old name goes with the next release"
+    assert [one.filename for one in told] == [__file__] * 3
+    scenario = load_scenario("paper")
+    world = scenario.reset(jax.random.key(0))
+    memory = Old().update_memories(scenario, world)
+    with pytest.warns(DeprecationWarning, match="approach is gradient_and_rate now"):
+        rows = Old().rows(scenario, world, memory)
+    plain = RangeBarrier().rows(scenario, world, memory)
+    np.testing.assert_allclose(rows.offsets, plain.offsets + 0.01 + (1.2 - 2.0) * plain.values, rtol=1e-5)
+    assert np.array_equal(memory, [1.0])
+    with pytest.warns(DeprecationWarning, match="remember is update_memories now") as told:
+        assert np.array_equal(Old().remember(scenario, world), memory)
+    assert told[0].filename == __file__
+    with pytest.warns(DeprecationWarning, match="recall is update_memory now"):
+        side = PursuitBarrier().recall(scenario, world.evader, world.pursuer, None)
+    assert side == PursuitBarrier().update_memory(scenario, world.evader, world.pursuer, None)
+
+
+def test_old_names_of_the_game_shield_still_work_and_say_so():
+    scenario = load_scenario("paper")
+    with pytest.warns(DeprecationWarning, match="wish_picks_side is nominal_picks_side now") as told:
+        shield = GameShield(scenario, wish_picks_side=True)
+    assert told[0].filename == __file__
+    assert shield.nominal_picks_side
+    world = scenario.reset(jax.random.key(0))
+    given = world, jnp.array([0.1, 0.0]), shield.init(world)
+    with pytest.warns(DeprecationWarning, match="heed is filter_unchecked now"):
+        old = shield.heed(*given)
+    np.testing.assert_array_equal(old[0], shield.filter_unchecked(*given)[0])

@@ -42,8 +42,8 @@ def _recall(scenario, points, sides):
     @jax.vmap
     def one(z, side):
         pose = jnp.zeros(3)
-        now = BARRIER.recall(scenario, z, pose, side)
-        own = BARRIER.recall(scenario, z, pose, None)
+        now = BARRIER.update_memory(scenario, z, pose, side)
+        own = BARRIER.update_memory(scenario, z, pose, None)
         values = [BARRIER.value(scenario, z, pose, s) for s in (side, now, own)]
         return now, own, *values, BARRIER.row(scenario, z, pose, now)[2]
 
@@ -88,7 +88,7 @@ def test_an_evader_that_zigzags_over_the_axis_keeps_its_side(x64, parameters):
     @jax.jit
     def follow(points):
         def step(side, z):
-            side = BARRIER.recall(scenario, z, jnp.zeros(3), side)
+            side = BARRIER.update_memory(scenario, z, jnp.zeros(3), side)
             return side, side
 
         return jax.lax.scan(step, jnp.ones(()), points)[1]

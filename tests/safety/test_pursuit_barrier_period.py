@@ -49,7 +49,7 @@ def _held(scenario, worlds, sides, wishes):
 
     @jax.vmap
     def one(world, sides, wish):
-        memory = KNOWN.remember(scenario, world, sides)
+        memory = KNOWN.update_memories(scenario, world, sides)
         rows = KNOWN.rows_over_period(scenario, world, memory)
         answer = project(wish, rows.normals, rows.offsets, scenario.evader_speed, hard=2)
 
@@ -57,7 +57,7 @@ def _held(scenario, worlds, sides, wishes):
             time = share * scenario.control_period
             pose = drive(world.pursuer, world.wheel_speeds[0], scenario.pursuer_half_axle, time)
             evader = world.evader + time * answer.action
-            return KNOWN.value(scenario, evader, pose, KNOWN.recall(scenario, evader, pose, None))
+            return KNOWN.value(scenario, evader, pose, KNOWN.update_memory(scenario, evader, pose, None))
 
         after = jax.vmap(later)(jnp.array([0.5, 1.0]))
         return rows.values[0], rows.offsets, answer.status, after
@@ -79,7 +79,7 @@ def test_the_rows_can_be_kept_and_then_h_sinks_no_faster_than_allowed(x64, param
     # Both rows at once cannot be kept where the side to follow changes within the period, and only there.
     kept = status != Status.INFEASIBLE
     assert kept.mean() > 0.98
-    allowed = jax.vmap(lambda h: KNOWN.allowance(scenario, h))(jnp.asarray(before))
+    allowed = jax.vmap(lambda h: KNOWN.alpha(scenario, h))(jnp.asarray(before))
     for share, value in zip((0.5, 1.0), after.T, strict=True):
         spent = np.minimum(share * period * np.asarray(allowed), before)
         assert np.all((before - spent - value)[kept] <= 1e-12)
@@ -92,7 +92,7 @@ def test_rows_over_a_period_tend_to_the_row_of_the_instant(x64):
     @jax.jit
     @jax.vmap
     def both(world, sides):
-        memory = KNOWN.remember(scenario, world, sides)
+        memory = KNOWN.update_memories(scenario, world, sides)
         return KNOWN.rows(scenario, world, memory), KNOWN.rows_over_period(scenario, world, memory)
 
     instant, period = both(worlds, sides)
@@ -122,7 +122,7 @@ def _stand_still(scenario, pursuer, over_period, keys):
         world, memory, least = carry
         wheels = pursuer(scenario, world, key)[None]
         announced = eqx.tree_at(lambda w: w.wheel_speeds, world, wheels)
-        memory = KNOWN.remember(scenario, announced, memory)
+        memory = KNOWN.update_memories(scenario, announced, memory)
         period = KNOWN.rows_over_period(scenario, announced, memory)
         instant = KNOWN.rows(scenario, announced, memory)
         normals = jnp.where(over_period, period.normals, instant.normals)
@@ -135,7 +135,7 @@ def _stand_still(scenario, pursuer, over_period, keys):
     def episode(key):
         start, key = jax.random.split(key)
         world = scenario.reset(start)
-        carry = (world, KNOWN.remember(scenario, world), jnp.asarray(jnp.inf))
+        carry = (world, KNOWN.update_memories(scenario, world), jnp.asarray(jnp.inf))
         return jax.lax.scan(step, carry, jax.random.split(key, 400))[0][2]
 
     return episode(keys)

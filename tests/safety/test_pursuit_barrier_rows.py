@@ -53,7 +53,7 @@ def _rows(barrier, scenario, points, wheels, sides):
     @jax.vmap
     def one(z, wheel, side):
         robot = jnp.concatenate([jnp.zeros(3, z.dtype), wheel]) if barrier.known_velocity else jnp.zeros(3)
-        memory = barrier.recall(scenario, z, robot, side)
+        memory = barrier.update_memory(scenario, z, robot, side)
         return memory, *barrier.row(scenario, z, robot, memory)
 
     return one(points, wheels, sides)
@@ -65,7 +65,7 @@ def _rates(barrier, scenario, points, wheels, sides):
 
     def one(z, side, wheel):
         robot = jnp.concatenate([jnp.zeros(3, z.dtype), wheel])
-        return barrier.approach(scenario, z, robot, side)[1]
+        return barrier.gradient_and_rate(scenario, z, robot, side)[1]
 
     over_wheels = jax.vmap(one, in_axes=(None, None, 0))
     return jax.vmap(over_wheels, in_axes=(0, 0, None))(points, sides, wheels)
@@ -120,7 +120,7 @@ def _along_true_motion(scenario, points, poses, wheels, velocities, sides):
             return KNOWN.value(scenario, glide(point, velocity, t), moved, side)
 
         step = jnp.asarray(2e-6)
-        normal, rate = KNOWN.approach(scenario, point, jnp.concatenate([pose, wheel]), side)
+        normal, rate = KNOWN.gradient_and_rate(scenario, point, jnp.concatenate([pose, wheel]), side)
         return (h(step) - h(-step)) / (2.0 * step), jnp.sum(normal * velocity) - rate
 
     return one(points, poses, wheels, velocities, sides)
@@ -169,7 +169,7 @@ def test_a_period_of_the_known_motion_loses_what_the_row_says_and_second_order_m
     def loss(point, wheel, period):
         robot = jnp.concatenate([jnp.zeros(3), wheel])
         side = jnp.sign(point[1])
-        normal, rate = KNOWN.approach(scenario, point, robot, side)
+        normal, rate = KNOWN.gradient_and_rate(scenario, point, robot, side)
         moved = drive(robot[:3], wheel, scenario.pursuer_half_axle, period)
         before = KNOWN.value(scenario, point, robot, side)
         return before - KNOWN.value(scenario, point + period * rate * normal, moved, side)
@@ -226,7 +226,7 @@ def test_rows_and_their_slopes_are_finite_in_every_awkward_place(precision):
     def everything(scenario, points, wheels):
         def one(point, wheel, side):
             robot = jnp.concatenate([jnp.zeros(3, point.dtype), wheel])
-            memory = KNOWN.recall(scenario, point, robot, side)
+            memory = KNOWN.update_memory(scenario, point, robot, side)
 
             def row(point, wheel):
                 return KNOWN.row(scenario, point, jnp.concatenate([robot[:3], wheel]), memory)
@@ -320,7 +320,7 @@ def test_a_pursuer_alone_cannot_lower_the_clipped_barrier_faster_than_the_evader
         return before - clipped(pose)
 
     def _own_side(z, pose):
-        return ANY.recall(scenario, z, pose, None)
+        return ANY.update_memory(scenario, z, pose, None)
 
     allowed = scenario.evader_speed * jnp.sum(times, axis=1)
     assert np.all(lost(points, wheels, times) <= allowed + 1e-12)

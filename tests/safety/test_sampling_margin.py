@@ -8,7 +8,7 @@ import pytest
 
 from sidestep.pursuit import CaptureGame, make_pursuer, pursue
 from sidestep.safety import GameShield, PursuitBarrier, Status
-from sidestep.safety.barriers.sampling_margin import TOUCH, guarded, sampling_margin
+from sidestep.safety.barriers.sampling_margin import TOUCH, sampling_margin, with_margins
 from sidestep.world import World, load_scenario
 
 
@@ -35,7 +35,7 @@ def test_margin_is_finite_and_never_makes_a_pursuer_win(fields):
     margin = float(sampling_margin(scenario))
     assert np.isfinite(margin)
     assert margin >= 0.0
-    assert bool(CaptureGame.of(guarded(scenario)).evader_can_escape) == bool(
+    assert bool(CaptureGame.of(with_margins(scenario)).evader_can_escape) == bool(
         CaptureGame.of(scenario).evader_can_escape
     )
 

@@ -170,7 +170,7 @@ def test_between_pursuer_and_obstacle_the_pursuers_row_is_kept_first(precision):
     assert result.status == Status.INFEASIBLE
     assert result.slack < -0.01
     barrier = PursuitBarrier()
-    row = barrier.rows(scenario, world, barrier.remember(scenario, world))
+    row = barrier.rows(scenario, world, barrier.update_memories(scenario, world))
     assert row.normals[0] @ result.action >= row.offsets[0] - 1e-6
 
     # The paper's row cannot be kept here; it is violated as little as can be, by fleeing straight.

@@ -31,7 +31,7 @@ def least_barrier(world, evader):
     """The least of all barriers (m) at a place of the evader, from the barriers themselves."""
     pursuit, obstacle, none = PursuitBarrier(), ObstacleBarrier(), jnp.zeros((), evader.dtype)
     to_pursuers = [
-        pursuit.value(PAPER, evader, robot, pursuit.recall(PAPER, evader, robot, None))
+        pursuit.value(PAPER, evader, robot, pursuit.update_memory(PAPER, evader, robot, None))
         for robot in world.pursuers
     ]
     to_obstacles = [obstacle.value(PAPER, evader, robot, none) for robot in world.obstacles]

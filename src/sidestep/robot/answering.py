@@ -131,7 +131,7 @@ def _nominal(scenario: Scenario, policy: Any, world: World, wished: Array, ask: 
         nominal = jnp.where(length(way[0], way[1]) <= scenario.reach_distance, 0.0, nominal)
     if scenario.pursuer_count:
         barrier = PursuitBarrier()
-        rows = barrier.rows(scenario, world, barrier.remember(scenario, world))
+        rows = barrier.rows(scenario, world, barrier.update_memories(scenario, world))
         away = rows.normals[jnp.argmin(rows.values)]
         nominal = jnp.where(flee > 0.0, scenario.evader_speed * away, nominal)
     return nominal

@@ -16,7 +16,7 @@ from sidestep.bridges.export.scene import Scene, for_each, picks
 from sidestep.pursuit import CaptureGame
 from sidestep.safety import GameShield
 from sidestep.safety.barriers.pursuit_barrier import KEEP_SIDE, LOST_SIDE, STEEPER
-from sidestep.safety.barriers.sampling_margin import guarded, sampling_margin
+from sidestep.safety.barriers.sampling_margin import sampling_margin, with_margins
 
 _SMALLEST = 1e-30
 
@@ -62,7 +62,7 @@ def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
         )
     if not float(scenario.pursuer_gain) > 0.0:
         raise ValueError("scenario field 'pursuer_gain' = 0: an ONNX filter needs one greater than 0")
-    if shield.known_velocity or shield.wish_picks_side:
+    if shield.known_velocity or shield.nominal_picks_side:
         raise ValueError("an ONNX filter has the rows of make_shield('game', scenario); this shield's differ")
     kept = _constants(shield)
     if budget is None:
@@ -73,7 +73,7 @@ def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
 
 def _constants(shield: GameShield) -> Constants:
     scenario, budget = shield.scenario, shield.budget
-    kept = guarded(scenario, budget)
+    kept = with_margins(scenario, budget)
     game, speed = CaptureGame.of(kept), float(scenario.evader_speed)
     usable = game.usable_angle
     gain = float(scenario.pursuer_gain)

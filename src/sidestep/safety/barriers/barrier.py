@@ -1,7 +1,7 @@
 """Control barrier functions and their rows: what the evader's velocity must satisfy to stay free.
 
-A barrier h is at least 0 where the evader is free of one other robot. With class-K function alpha its row
-n.u >= c demands h' >= -alpha(h) of the evader's velocity u (m/s, world axes), so that h never crosses 0.
+A barrier h is at least 0 where the evader is free of one other robot. With a class-K function alpha its row
+n.u >= c demands h' >= -alpha(h) of the evader's velocity u (m/s, world axes). Then h never crosses 0.
 """
 
 import abc
@@ -13,11 +13,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, Lanes, real, stack
+from sidestep._moved import renamed, renamed_methods
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
 NormalAndRate: TypeAlias = tuple[Float[Array, "2 *lanes"], Float[Array, "*lanes"]]
-"""Unit normal and rate (m/s), see `Barrier.approach`."""
+"""Unit normal and rate (m/s), see `Barrier.gradient_and_rate`."""
+
+_RENAMED = {"approach": "gradient_and_rate", "allowance": "alpha", "recall": "update_memory"}
 
 
 class BarrierRows(eqx.Module):
@@ -37,8 +40,8 @@ def compose(*rows: BarrierRows) -> BarrierRows:
     """Boolean AND of barriers: the value is the least, and all rows hold.
 
     h_c = min h_i (paper, eq. Boolean; Glotfelter, Cortes, Egerstedt, "Nonsmooth barrier functions with
-    applications to multi-robot systems", 2017). Demanding every row, not only that of the least barrier,
-    keeps the action continuous where two barriers meet.
+    applications to multi-robot systems", 2017). Every row is demanded, not only that of the least barrier:
+    the action then stays continuous where two barriers meet.
     """
     return BarrierRows(
         jnp.concatenate([entry.values for entry in rows]),
@@ -50,16 +53,26 @@ def compose(*rows: BarrierRows) -> BarrierRows:
 class Barrier(eqx.Module):
     """One kind of barrier, kept towards every robot of a kind.
 
-    Its row for one robot is n.u >= rate - alpha(h): n = dh/dp_e is how the evader raises h, `rate` how fast
-    the other robot lowers it (as far as this barrier takes it to), alpha(h) how fast h may shrink.
+    The row for one robot is n.u >= rate - alpha(h), with
 
-    `memory ()` is what must be kept in mind about one robot from step to step; barriers without memory
-    leave it 0.
+    - n = dh/dp_e, the direction in which the evader raises h
+    - rate, how fast (m/s) the other robot lowers h, by this barrier's assumption about its motion
+    - alpha(h), how fast (m/s) h may shrink
+
+    `memory ()` is one number per robot, kept from one control period to the next. A barrier without memory
+    leaves it 0.
+
+    Subclasses may still define `approach`, `allowance` and `recall`, the old names of `gradient_and_rate`,
+    `alpha` and `update_memory`, with a `DeprecationWarning`.
     """
+
+    def __init_subclass__(cls, **arguments: Any):
+        super().__init_subclass__(**arguments)
+        renamed_methods(cls, _RENAMED)
 
     @abc.abstractmethod
     def robots(self, world: World) -> Float[Array, "n d *lanes"]:
-        """The robots this barrier is kept towards, as the world holds them."""
+        """The robots that this barrier is kept towards: `world.pursuers`, or `world.obstacles`."""
 
     @abc.abstractmethod
     def value(
@@ -69,10 +82,10 @@ class Barrier(eqx.Module):
         robot: Float[AnyArray, "d *lanes"],
         memory: Float[AnyArray, "*lanes"],
     ) -> Lanes:
-        """h (m) of one evader position (m) towards one robot."""
+        """h (m) for one evader position (m) and one robot."""
 
     @abc.abstractmethod
-    def approach(
+    def gradient_and_rate(
         self,
         scenario: Scenario,
         evader: Float[AnyArray, "2 *lanes"],
@@ -82,18 +95,18 @@ class Barrier(eqx.Module):
         """Unit normal n = dh/dp_e in world axes, and the rate (m/s) at which the robot lowers h."""
 
     @abc.abstractmethod
-    def allowance(self, scenario: Scenario, h: Float[AnyArray, "*lanes"]) -> Lanes:
-        """alpha(h) (m/s), increasing, alpha(0) = 0: how fast h may shrink."""
+    def alpha(self, scenario: Scenario, h: Float[AnyArray, "*lanes"]) -> Lanes:
+        """How fast (m/s) h may shrink: class K, so alpha(0) = 0 and alpha increases with h."""
 
     @abc.abstractmethod
-    def recall(
+    def update_memory(
         self,
         scenario: Scenario,
         evader: Float[AnyArray, "2 *lanes"],
         robot: Float[AnyArray, "d *lanes"],
         memory: Float[AnyArray, "*lanes"] | None,
     ) -> Lanes:
-        """The memory to use now, given the one of the step before, or none at the start."""
+        """The memory for this control period, from that of the last one; None at the start of an episode."""
 
     def row(
         self,
@@ -104,26 +117,28 @@ class Barrier(eqx.Module):
     ) -> tuple[Lanes, Float[Array, "2 *lanes"], Lanes]:
         """h (m), and normal n and offset c (m/s) of the row n.u >= c, towards one robot."""
         h = self.value(scenario, evader, robot, memory)
-        normal, rate = self.approach(scenario, evader, robot, memory)
-        return h, normal, rate - self.allowance(scenario, h)
+        normal, rate = self.gradient_and_rate(scenario, evader, robot, memory)
+        return h, normal, rate - self.alpha(scenario, h)
 
     def rows(self, scenario: Scenario, world: World, memory: Float[AnyArray, "n *lanes"]) -> BarrierRows:
-        """Value and row towards every robot; `memory` as `remember` returned it for this world."""
+        """Value and row towards every robot; `memory` as `update_memories` returned it for this world."""
         row = jax.vmap(self.row, in_axes=(None, None, 0, 0))
         return BarrierRows(*row(scenario, world.evader, self.robots(world), memory))
 
-    def remember(
+    def update_memories(
         self, scenario: Scenario, world: World, memory: Float[AnyArray, "n *lanes"] | None = None
     ) -> Float[Array, "n *lanes"]:
-        """`recall` for every robot."""
-        recall = jax.vmap(self.recall, in_axes=(None, None, 0, None if memory is None else 0))
-        return recall(scenario, world.evader, self.robots(world), memory)
+        """`update_memory` for every robot."""
+        update = jax.vmap(self.update_memory, in_axes=(None, None, 0, None if memory is None else 0))
+        return update(scenario, world.evader, self.robots(world), memory)
+
+    remember = renamed(update_memories, "remember")
 
 
 def _away(
     evader: Float[AnyArray, "2 *lanes"], robot: Float[AnyArray, "d *lanes"]
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """Distance, and unit direction from the robot; at distance 0, where every direction is as good, +x."""
+    """Distance (m) and unit direction from the robot to the evader; +x at distance 0."""
     x, y = evader[0] - robot[0], evader[1] - robot[1]
     squared = x * x + y * y
     apart = squared > 0.0
@@ -148,26 +163,27 @@ class ObstacleBarrier(Barrier):
     def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return _away(evader, robot)[0] - scenario.collision_distance
 
-    def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> NormalAndRate:
+    def gradient_and_rate(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> NormalAndRate:
         _, x, y = _away(evader, robot)
         return stack(x, y), x * robot[2] + y * robot[3]
 
-    def allowance(self, scenario: Scenario, h: Any) -> Lanes:
+    def alpha(self, scenario: Scenario, h: Any) -> Lanes:
         return scenario.obstacle_gain * h
 
-    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
+    def update_memory(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return jnp.zeros_like(real(evader)[0])
 
 
 @final
 class RangeBarrier(Barrier):
-    """The paper's barrier towards the pursuer (eq. h_pv, Au2), which takes it to drive straight on at V.
+    """The paper's barrier towards the pursuer (eq. h_pv, Au2). It assumes that the pursuer drives straight on
+    at full speed V.
 
     h = |p_e - p_d| - l,  n = (p_e - p_d)/|p_e - p_d|,  c = V n.(cos theta, sin theta) - gamma_pv h.
 
-    This is the paper's derivation; its printed b_pv has the sign of the pursuer's velocity turned round.
-    The row cannot be kept close ahead of the pursuer, where n.u <= v_e < V: there h < (V - v_e)/gamma_pv.
-    And it takes a pursuer that backs onto the evader to be driving away.
+    This follows the paper's derivation; the printed b_pv has the opposite sign of the pursuer's velocity.
+    The row has two faults. Close ahead of the pursuer, at h < (V - v_e)/gamma_pv, no velocity satisfies it,
+    because n.u <= v_e < V. And a pursuer that reverses towards the evader counts as one that leaves.
     """
 
     def robots(self, world: World) -> Float[Array, "n 3 *lanes"]:
@@ -176,13 +192,13 @@ class RangeBarrier(Barrier):
     def value(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return _away(evader, robot)[0] - scenario.capture_distance
 
-    def approach(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> NormalAndRate:
+    def gradient_and_rate(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> NormalAndRate:
         _, x, y = _away(evader, robot)
         ahead = x * jnp.cos(robot[2]) + y * jnp.sin(robot[2])
         return stack(x, y), scenario.pursuer_speed * ahead
 
-    def allowance(self, scenario: Scenario, h: Any) -> Lanes:
+    def alpha(self, scenario: Scenario, h: Any) -> Lanes:
         return scenario.pursuer_gain * h
 
-    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
+    def update_memory(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return jnp.zeros_like(real(evader)[0])

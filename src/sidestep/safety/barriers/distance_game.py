@@ -1,4 +1,4 @@
-"""How near can a pursuer come that no formula is known for? The game of the least distance, on a grid."""
+"""How near can a pursuer come for which no formula is known? The game of the least distance, on a grid."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _LONGEST = 40.0
 
 
 class DistanceValue(eqx.Module):
-    """The least distance W (m) that the pursuer can force for all time, over the evader's place in its frame.
+    """The least distance W (m) that the pursuer can ever force, over the evader's position in its frame.
 
-    `values (n, n)` at the nodes of a square of side 2 `reach` (m) about the pursuer, x ahead first. `error`
-    (m) is how far they are from a solution on half as many cells, on average, `settled` whether they had
-    stopped sinking.
+    - `values (n, n)` m, at the nodes of a square of side 2 `reach` (m) about the pursuer; first axis x, ahead
+    - `error` m, their mean difference from a solution on half as many cells
+    - `settled`: whether the iteration had converged
     """
 
     values: Float[Array, "n n"]
@@ -168,14 +168,14 @@ def solve_distance(
 
     Dynamic programming: W(z) = min(|z|, max over the evader's, min over the pursuer's motions of W one time
     step later), repeated until it settles, on `cells` x `cells` cells out to `reach` (m; five capture
-    distances by default), and again on half as many, which says how far off it is. W does not depend on the
-    capture distance: one solution serves all. `progress(share)` is told how fast W still sinks, as a share
-    of the pursuer's speed.
+    distances by default). A second solution on half as many cells gives the error. W does not depend on the
+    capture distance: one solution serves all. `progress(share)` gets how fast W still sinks, as a share of
+    the pursuer's speed.
 
-    A pursuer with a sharp valley ahead of it, such as a differential drive, comes out too strong (its l_max
-    0.167 instead of 0.201 m with 80 cells); for that one there is `PursuitBarrier`, which is exact.
+    If W has a sharp valley, as ahead of a differential drive, the pursuer comes out too strong: l_max is
+    0.167 instead of 0.201 m with 80 cells. For the differential drive use `PursuitBarrier`, which is exact.
 
-    **Raises** `ValueError` for fewer than 40 cells or an odd number of them, and for a reach within two
+    **Raises** `ValueError` for fewer than 40 cells or an odd number of them, and for a reach below two
     capture distances.
     """
     capture = float(scenario.capture_distance)
@@ -203,9 +203,9 @@ class _Height(eqx.Module):
 def grid_barrier(
     scenario: Scenario, value: DistanceValue | None = None, gain: float | None = None
 ) -> FrameBarrier:
-    """h(z) = W(z) - l - error as a barrier, for `shield_of` and `evaluate`; W is solved for if not given.
+    """h(z) = W(z) - l - error as a barrier, for `shield_of` and `evaluate`; solves for W if it is not given.
 
-    **Raises** `ValueError` where the pursuer wins: where it can force less than l + error from anywhere.
+    **Raises** `ValueError` where the pursuer wins: from everywhere it can force a distance below l + error.
     """
     value = solve_distance(scenario) if value is None else value
     kept = float(scenario.capture_distance) + value.error

@@ -1,4 +1,4 @@
-"""A barrier of one's own from its value alone: a function of where the evader is, seen from the pursuer."""
+"""A custom barrier from its value alone: a function of the evader's position in the pursuer's frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sidestep.world.state import World
 
 
 def pursuer_corners(scenario: Scenario) -> Float[Array, "n 2"]:
-    """Speeds (m/s) and turn rates (rad/s) whose convex hull holds all that a pursuer can take."""
+    """Speeds (m/s) and turn rates (rad/s) whose convex hull holds every motion of the pursuer."""
     if scenario.pursuer_model is not None:
         return scenario.pursuer_model.corners(scenario)
     speed = scenario.pursuer_speed
@@ -28,11 +28,11 @@ def pursuer_corners(scenario: Scenario) -> Float[Array, "n 2"]:
 
 @final
 class FrameBarrier(Barrier):
-    """h(z) towards every pursuer, z (m) being the evader's place in its frame: x ahead, y to the left.
+    """h(z) towards every pursuer, with z (m) the evader's position in its frame: x ahead, y to the left.
 
-    The row is n.u >= max over the pursuer's motions of (v g_x - omega (g_x z_y - g_y z_x)) - gamma h with
-    g = dh/dz by automatic differentiation and n = R(theta) g: h' >= -gamma h whatever the pursuer does. The
-    motions are affine in (v, omega), so the greatest is at one of the model's `corners`.
+    The row is n.u >= max over the pursuer's motions of (v g_x - omega (g_x z_y - g_y z_x)) - gamma h, with
+    g = dh/dz by automatic differentiation and n = R(theta) g. It gives h' >= -gamma h whatever the pursuer
+    does. The rate is affine in (v, omega), so its maximum is at one of the model's `corners`.
 
     **Arguments:** `function(scenario, z (2,)) -> h ()` in m, written with JAX, `gain` gamma in 1/s (the
     scenario's `pursuer_gain` without one). Arrays within the function (a grid of values, say) stay traced.
@@ -57,7 +57,7 @@ class FrameBarrier(Barrier):
         z = to_pursuer_frame(evader, robot)
         return lane_by_lane(lambda z: self._at(scenario, z)[0], z.ndim - 1, z)
 
-    def approach(
+    def gradient_and_rate(
         self, scenario: Scenario, evader: Any, robot: Any, memory: Any
     ) -> tuple[Float[Array, "2 *lanes"], Lanes]:
         z = to_pursuer_frame(evader, robot)
@@ -68,8 +68,8 @@ class FrameBarrier(Barrier):
         normal = stack(cosine * ahead - sine * left, sine * ahead + cosine * left)
         return normal, jnp.max(jnp.stack(rates), axis=0)
 
-    def allowance(self, scenario: Scenario, h: Any) -> Lanes:
+    def alpha(self, scenario: Scenario, h: Any) -> Lanes:
         return (scenario.pursuer_gain if self.gain is None else self.gain) * h
 
-    def recall(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
+    def update_memory(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
         return jnp.zeros_like(real(evader)[0])

@@ -1,4 +1,4 @@
-"""Is this a barrier? What is wrong with it, in plain words, before anything relies on it."""
+"""Is this a barrier? What is wrong with it, before anything relies on it?"""
 
 from __future__ import annotations
 
@@ -20,25 +20,29 @@ from sidestep.world.state import World
 _SAMPLES = 2048
 _GRADIENT_OFF = 0.02
 _KINKS = 0.05
-"""Share of places at which normal and gradient may differ: a barrier may have edges."""
+"""Share of positions at which normal and gradient may differ: a barrier may have edges."""
 _VANISHED = 1e-3
 _NEAR = 0.1
-"""A barrier's row must be kept where it matters: at values up to this share of the contact distance."""
+"""A row must be feasible at values of h from 0 to this share of the contact distance."""
 _INSIDE = 0.9
-"""Share of the contact distance within which there is no doubt that there is contact."""
+"""Within this share of the contact distance there certainly is contact."""
 _FEW = 0.001
-"""Share of places that may be rounding."""
+"""Share of positions that may be due to rounding."""
 
 
 class BarrierWarning(UserWarning):
-    """A barrier works, but cannot guarantee what barriers guarantee."""
+    """A barrier that works, but has no guarantee."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BarrierProbe:
-    """What a look at a barrier found: `errors`, for which it is none, and `doubts`, for which it guarantees
-    nothing. `shortfall` is by how much (m/s) its rate is less than the worst that the other robot can do, and
-    `infeasible` the share of places just outside 0 at which no velocity of the evader keeps the row."""
+    """What a probe found.
+
+    - `errors` why it is no barrier
+    - `doubts` why it guarantees nothing
+    - `shortfall` m/s, by how much its rate is below the fastest that the other robot can lower h
+    - `infeasible` share of the positions with h just above 0 at which no velocity keeps the row
+    """
 
     errors: tuple[str, ...]
     doubts: tuple[str, ...]
@@ -56,7 +60,7 @@ def _sample_world(scenario: Scenario) -> World:
 
 
 def _shape_errors(barrier: Barrier, scenario: Scenario, world: World) -> list[str]:
-    """What is wrong with the shapes of a barrier's answers, the first of it: what follows follows from it."""
+    """The first wrong shape among a barrier's answers, since later ones may follow from it."""
     evader, shapes = world.evader, eqx.filter_eval_shape
 
     def shape(answer: Any) -> Any:
@@ -73,8 +77,8 @@ def _shape_errors(barrier: Barrier, scenario: Scenario, world: World) -> list[st
         ]
     robot = robots[0]
     try:
-        asked = "recall(scenario, evader, robot, None)"
-        memory = shapes(barrier.recall, scenario, evader, robot, None)
+        asked = "update_memory(scenario, evader, robot, None)"
+        memory = shapes(barrier.update_memory, scenario, evader, robot, None)
         if shape(memory) != ():
             return [
                 f"{asked} must give one number, 0 for a barrier without memory; got shape {shape(memory)}"
@@ -84,12 +88,12 @@ def _shape_errors(barrier: Barrier, scenario: Scenario, world: World) -> list[st
         h = shapes(barrier.value, scenario, evader, robot, memory)
         if shape(h) != ():
             return [f"{asked} must give one number, h in m; got shape {shape(h)}"]
-        asked = "approach(scenario, evader, robot, memory)"
-        answer: Any = shapes(barrier.approach, scenario, evader, robot, memory)
+        asked = "gradient_and_rate(scenario, evader, robot, memory)"
+        answer: Any = shapes(barrier.gradient_and_rate, scenario, evader, robot, memory)
         if not isinstance(answer, tuple) or shape(answer) != ((2,), ()):
             return [f"{asked} must give (normal (2,), rate ()); got shapes {shape(answer)}"]
-        asked = "allowance(scenario, h)"
-        allowed = shapes(barrier.allowance, scenario, memory)
+        asked = "alpha(scenario, h)"
+        allowed = shapes(barrier.alpha, scenario, memory)
         if shape(allowed) != ():
             return [f"{asked} must give one number, in m/s; got shape {shape(allowed)}"]
     except Exception as error:
@@ -98,8 +102,7 @@ def _shape_errors(barrier: Barrier, scenario: Scenario, world: World) -> list[st
 
 
 def _motions(scenario: Scenario, world: World, robots: Array, robot: Array) -> Float[Array, "n d"] | None:
-    """How fast the numbers of a robot can change, one row for each extreme motion; None if that is "
-    "unknown."""
+    """Rates of a robot's numbers, one row for each extreme motion; None if they are unknown."""
     if robots.shape == world.obstacles.shape:
         return jnp.concatenate([robot[2:4], jnp.zeros(2)])[None]
     if robots.shape != world.pursuers.shape:
@@ -119,9 +122,9 @@ def _look(
         robot = robots[0]
         if robots.shape == world.pursuers.shape:
             robot = robot.at[2].set(angle)
-        memory = barrier.recall(scenario, evader, robot, None)
+        memory = barrier.update_memory(scenario, evader, robot, None)
         h, normal, _ = barrier.row(scenario, evader, robot, memory)
-        rate = barrier.approach(scenario, evader, robot, memory)[1]
+        rate = barrier.gradient_and_rate(scenario, evader, robot, memory)[1]
         gradient, by_robot = jax.grad(
             lambda evader, robot: barrier.value(scenario, evader, robot, memory), argnums=(0, 1)
         )(evader, robot)
@@ -133,20 +136,19 @@ def _look(
             "gradient": gradient,
             "rate": rate,
             "worst": worst,
-            "allowed": barrier.allowance(scenario, h),
+            "allowed": barrier.alpha(scenario, h),
         }
 
     return jax.vmap(at)(evaders, angles)
 
 
 def probe_barrier(barrier: Barrier, scenario: Scenario) -> BarrierProbe:
-    """Look at a barrier at 2048 places around another robot, up to three contact distances away.
+    """Try a barrier at 2048 positions around another robot, up to three contact distances away.
 
-    It is none (`errors`) if its answers have wrong shapes or are not finite, if alpha(0) is not 0 or alpha
-    does not increase (class K through zero), if h is above 0 in contact, if the normal is not dh/dp_e, or if
-    that vanishes: then the evader's velocity has no hold on h (relative degree above 1). It guarantees
-    nothing (`doubts`) if the other robot can lower h faster than the rate, or where the row asks of the
-    evader more than it has.
+    It is no barrier (`errors`) if its answers have wrong shapes or are not finite, if alpha is not of class
+    K, if h is above 0 in contact, if the normal is not dh/dp_e, or if dh/dp_e vanishes: the evader's velocity
+    then does not act on h (relative degree above 1). It guarantees nothing (`doubts`) if the other robot can
+    lower h faster than the rate, or if the row asks for more speed than the evader has.
     """
     world = _sample_world(scenario)
     errors = _shape_errors(barrier, scenario, world)
@@ -184,7 +186,7 @@ def _judge(
         at = where(np.argmin(finite))
         return [f"{', '.join(broken)} not finite, for instance with {at}"], [], 0.0, 0.0
 
-    errors, doubts = _allowance_errors(barrier, scenario, float(np.max(seen["h"]))), []
+    errors, doubts = _alpha_errors(barrier, scenario, float(np.max(seen["h"]))), []
     size = np.linalg.norm(seen["gradient"], axis=1)
     off = np.linalg.norm(seen["normal"] - seen["gradient"], axis=1)
     wrong = off > _GRADIENT_OFF * np.maximum(size, 1e-6)
@@ -192,8 +194,8 @@ def _judge(
     if np.mean(vanished) > _KINKS:
         errors.append(
             f"h does not change with the evader's position at {np.mean(vanished):.0%} of the places: its "
-            "velocity has no hold on h there (relative degree above 1). Write h of the point that moves as "
-            "it is told (EvaderModel.control_point), or of position and velocity together"
+            "velocity does not act on h there (relative degree above 1). Write h of the point that moves as "
+            "commanded (EvaderModel.control_point), or of position and velocity together"
         )
     elif np.mean(wrong) > _KINKS:
         at = int(np.argmax(off))
@@ -237,20 +239,20 @@ def _judge(
     return errors, doubts, shortfall, infeasible
 
 
-def _allowance_errors(barrier: Barrier, scenario: Scenario, largest: float) -> list[str]:
-    """What keeps alpha from being of class K through zero."""
+def _alpha_errors(barrier: Barrier, scenario: Scenario, largest: float) -> list[str]:
+    """Why alpha is not of class K."""
     values = jnp.linspace(0.0, max(largest, 1e-3), 65, dtype=float)
-    allowed = np.asarray(jax.vmap(lambda h: barrier.allowance(scenario, h))(values))
+    allowed = np.asarray(jax.vmap(lambda h: barrier.alpha(scenario, h))(values))
     errors = []
     if abs(allowed[0]) > 1e-6:
         errors.append(
-            f"allowance(0) = {allowed[0]:.3g} m/s: it must be 0 (class K through zero), or else h may go on "
+            f"alpha(0) = {allowed[0]:.3g} m/s: it must be 0 (class K through zero), or else h may go on "
             "sinking at 0"
         )
     if np.any(np.diff(allowed) <= 0.0):
         at = int(np.argmin(np.diff(allowed)))
         errors.append(
-            f"the allowance does not increase with h: {allowed[at]:.3g} m/s at h = {values[at]:.3g} m, "
+            f"alpha does not increase with h: {allowed[at]:.3g} m/s at h = {values[at]:.3g} m, "
             f"{allowed[at + 1]:.3g} at {values[at + 1]:.3g} (it must be of class K)"
         )
     return errors

@@ -1,4 +1,4 @@
-"""What the `game` shield keeps beyond the distances of capture and collision."""
+"""What does the `game` shield keep beyond the distances of capture and collision?"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,18 +9,17 @@ from sidestep.safety.barriers.budget import Budget
 from sidestep.world.scenario import Scenario
 
 TOUCH = 1e-5
-"""Distance (m) kept beyond the collision distance: held against a row for long, a barrier comes to 0 but for
-rounding, which would count as contact."""
+"""Distance (m) kept beyond the collision distance. A barrier that is long held at its row comes to 0 up to
+rounding, and that would count as contact."""
 
 
 def sampling_margin(scenario: Scenario) -> Scalar:
     """Distance (m) that the shield keeps beyond the capture distance: min(V^2 T^2/b, (l_max - l)/2).
 
-    A pursuer beside the evader that drives on an arc with its inner wheel at rest lowers the barrier by up
-    to V^2 T^2/(8 b) within one period T, before the shield is asked again; attacks that did so again and
-    again gained some two such steps, and the margin is eight. Where l_max leaves less, half of what there
-    is, so that the rows keep some play; 0 where the pursuer wins anyway. That is what was seen to be enough
-    from ordinary starts, not a bound of what is possible (see `certify`).
+    A pursuer beside the evader that drives an arc with its inner wheel at rest lowers the barrier by up to
+    V^2 T^2/(8 b) within one period T. Attacks that repeat it gained about two such steps; the margin is
+    eight. If l_max leaves less than that, the margin is half of what it leaves, and 0 where the pursuer wins.
+    This was enough from ordinary starts. It is not a bound of what is possible, see `certify`.
     """
     game = CaptureGame.of(scenario)
     spare = jnp.maximum(game.largest_capture_distance - game.capture_distance, 0.0)
@@ -31,16 +30,16 @@ def sampling_margin(scenario: Scenario) -> Scalar:
 
 def margins(scenario: Scenario, budget: Budget | None = None) -> tuple[Scalar, Scalar]:
     """Distances (m) that the rows keep beyond those of capture and collision: `sampling_margin` and `TOUCH`,
-    and the budget's."""
+    and those of the budget."""
     pursuers, obstacles = sampling_margin(scenario), jnp.asarray(TOUCH, scenario.collision_distance.dtype)
     if budget is None:
         return pursuers, obstacles
     return pursuers + budget.towards_pursuers(scenario), obstacles + budget.towards_obstacles(scenario)
 
 
-def guarded(scenario: Scenario, budget: Budget | None = None) -> Scenario:
-    """The scenario with the distances that the rows keep, see `margins`, and the evader's speed that the
-    capture set is built for, see `Budget.sure_speed`."""
+def with_margins(scenario: Scenario, budget: Budget | None = None) -> Scenario:
+    """The scenario with the distances that the rows keep, see `margins`, and the evader speed for the capture
+    set, see `Budget.sure_speed`."""
     pursuers, obstacles = margins(scenario, budget)
     kept = scenario.capture_distance + pursuers
     speed = scenario.evader_speed if budget is None else budget.sure_speed(scenario, kept)

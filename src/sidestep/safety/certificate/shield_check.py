@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from sidestep._arrays import Scalar
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
-from sidestep.safety.barriers.sampling_margin import guarded, sampling_margin
+from sidestep.safety.barriers.sampling_margin import sampling_margin, with_margins
 from sidestep.safety.certificate.flow_map import seen_from, side_value, turn_drive_turn
 from sidestep.world.scenario import Scenario
 
@@ -52,7 +52,7 @@ def _rows(
 
     def at(z: Float[Array, "2"]) -> tuple[Array, Array, Array]:
         _, normal, offset = barrier.row(scenario, z, origin, left)
-        return barrier.recall(scenario, z, origin, left) > 0.0, normal, offset
+        return barrier.update_memory(scenario, z, origin, left) > 0.0, normal, offset
 
     return jax.vmap(at)(points)
 
@@ -61,7 +61,7 @@ def _rows(
 def _keeps_left(scenario: Scenario, eased: Scalar, points: Float[Array, "n 2"]) -> Bool[Array, "n"]:
     barrier = PursuitBarrier(eased=eased)
     origin, left = jnp.zeros(3, points.dtype), jnp.ones((), points.dtype)
-    return jax.vmap(lambda z: barrier.recall(scenario, z, origin, left) > 0.0)(points)
+    return jax.vmap(lambda z: barrier.update_memory(scenario, z, origin, left) > 0.0)(points)
 
 
 def _boundary(level: float, angle: float, beyond: float) -> Float[np.ndarray, "n 2"]:
@@ -92,7 +92,7 @@ def _allowed(
 
 def shield_level(scenario: Scenario) -> ShieldLevel:
     """The level that the `game` shield keeps against every pursuer, for exact measurements, on the grid."""
-    eased, scenario = sampling_margin(scenario), guarded(scenario)
+    eased, scenario = sampling_margin(scenario), with_margins(scenario)
     speed, period = float(scenario.evader_speed), float(scenario.control_period)
     rim, axle = float(scenario.pursuer_speed), float(scenario.pursuer_half_axle)
     wanted, angle = float(scenario.capture_distance), float(scenario.usable_angle)

@@ -105,11 +105,11 @@ def project(
 
     moving = limit > 0.0
     unit = jnp.where(moving, limit, 1.0)
-    wish, start, weight, unchanged = _aim(wanted, unit, circle)
+    scaled, start, weight, unchanged = _aim(wanted, unit, circle)
     rows, void = _normalise(x, y, c, unit)
     never = fold(jnp.logical_or, void & (c > tolerance(dtype) * unit), False)
 
-    answer, given_way = _solve(wish, start, weight, rows, hard, circle)
+    answer, given_way = _solve(scaled, start, weight, rows, hard, circle)
 
     infeasible = (given_way > tolerance(dtype)) | (answer.violation > tolerance(dtype))
     # A robot that cannot move has one action: zero.
@@ -142,17 +142,17 @@ def project_known(
     **Arguments:** as for `project`, but everything finite, normals of unit length, |nominal| <= the limit,
     and that more than 0.
     """
-    wish, weight = (nominal[0] / speed_limit, nominal[1] / speed_limit), jnp.zeros_like(nominal[0])
-    start = wish
+    scaled, weight = (nominal[0] / speed_limit, nominal[1] / speed_limit), jnp.zeros_like(nominal[0])
+    start = scaled
     if circle:
-        wish, start, weight, _ = _aim((nominal[0], nominal[1]), speed_limit, circle)
+        scaled, start, weight, _ = _aim((nominal[0], nominal[1]), speed_limit, circle)
     rows = Rows(normals[:, 0], normals[:, 1], offsets / speed_limit)
-    answer, _ = _solve(wish, start, weight, rows, hard, circle)
+    answer, _ = _solve(scaled, start, weight, rows, hard, circle)
     return stack(speed_limit * answer.x, speed_limit * answer.y)
 
 
 def _solve(
-    wish: _Pair,
+    scaled: _Pair,
     start: _Pair,
     weight: Lanes,
     rows: Rows,
@@ -167,7 +167,7 @@ def _solve(
             tier, level = relax(part(relaxed, 0, last), first, circle)
             relaxed = Rows(*(jnp.concatenate([a, b[last:]]) for a, b in zip(tier, relaxed, strict=True)))
             given_way = jnp.maximum(given_way, level)
-    return _closest(wish, start, weight, relaxed, hard, circle), given_way
+    return _closest(scaled, start, weight, relaxed, hard, circle), given_way
 
 
 def _aim(nominal: _Pair, unit: Scalar, circle: bool) -> tuple[_Pair, _Pair, Lanes, Bool[Array, "*lanes"]]:
@@ -227,7 +227,7 @@ def _worst(measure: Callable[[Any, Any], Any], lines: Any, rows: Any) -> Any:
 
 
 def _closest(
-    wish: _Pair,
+    scaled: _Pair,
     start: _Pair,
     weight: Lanes,
     rows: Rows,
@@ -238,7 +238,7 @@ def _closest(
 
     On line i, u = c_i n_i + t n_i' with n_i' a quarter turn to the left. Row j allows a t >= b there, with
     a = n_i x n_j and b = c_j - c_i n_i.n_j; the disc allows t^2 <= 1 - c_i^2. The closest point of the line
-    is the wish's t clipped to what all others allow.
+    is the scaled nominal action's t clipped to what all others allow.
     """
     if rows.c.shape[0] == 0:
         return _Answer(start[0], start[1], jnp.zeros_like(weight))
@@ -275,7 +275,7 @@ def _closest(
         likely = jnp.ones_like(c, bool)
     else:
         low, minus_high = _worst(limits, (x, y, c), rows)
-        allowed = jnp.minimum(jnp.maximum(x * wish[1] - y * wish[0], low), -minus_high)
+        allowed = jnp.minimum(jnp.maximum(x * scaled[1] - y * scaled[0], low), -minus_high)
         # The disc last: should the limits contradict each other, `violation` below will show it.
         t = jnp.clip(allowed, -half, half)
         # Some row that the start violates is active at the answer; the others only help against rounding.

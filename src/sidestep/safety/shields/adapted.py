@@ -1,4 +1,4 @@
-"""Shields for robots that a user brings: the built-in ones, told of a problem that covers the real one."""
+"""Shields for custom robots: the built-in shields, for a problem that covers the real one."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from sidestep.world.state import World
 
 
 def of_control_point(scenario: Scenario) -> Scenario:
-    """The same problem for the evader's control point, which is omnidirectional: it keeps the robot's
-    distances from others and the model's offset more."""
+    """The same problem for the evader's control point, which is omnidirectional. Its distances from others
+    are longer by the model's offset."""
     model = scenario.evader_model
     if model is None:
         return scenario
@@ -34,9 +34,9 @@ def of_control_point(scenario: Scenario) -> Scenario:
 
 
 def covered(scenario: Scenario) -> Scenario:
-    """The same problem with a differential drive in the pursuer's place that can do all that it can.
+    """The same problem with a differential drive in place of the pursuer that can do everything it can.
 
-    **Raises** `ValueError` where the pursuer's model names none.
+    **Raises** `ValueError` if the pursuer's model names none.
     """
     model = scenario.pursuer_model
     if model is None:
@@ -65,13 +65,13 @@ def world_of_control_point(scenario: Scenario, world: World) -> World:
 
 @final
 class AdaptedShield(Shield):
-    """A shield for robots of one's own: `inner` guards the evader's control point, a built-in one from a
-    differential drive that covers the pursuer.
+    """A shield for custom robots: `inner` guards the evader's control point against a differential drive that
+    covers the pursuer.
 
-    What `inner` promises of its problem holds for the real one as far as the models keep their words: the
-    control point moves as it is told and is no farther from the robot than `offset`, and the pursuer does
-    nothing that the covering one cannot. The barriers reported are those of `inner`: of the control point,
-    for distances that are the offset longer.
+    What `inner` guarantees for its problem holds for the real one if the models are right: the control point
+    moves as commanded and is at most `offset` from the robot, and the pursuer does nothing that the covering
+    drive cannot. The reported barriers are those of `inner`: of the control point, for distances that are
+    longer by the offset.
     """
 
     scenario: Scenario

@@ -1,4 +1,4 @@
-"""From rows to a shield's answer: what may not be trusted is found, the filter asked, the status given."""
+"""From rows to a shield's answer: drop what is not finite, ask the filter, give the status."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from sidestep.world.state import World
 
 
 def known_parts(world: World) -> Bool[Array, "n *lanes"]:
-    """Per pursuer and obstacle: whether it and the evader are where numbers say.
+    """For each pursuer and obstacle: whether its pose and the evader's position are finite.
 
-    Asked of the world itself, because a NaN can vanish on its way into a row: every comparison with it is
+    The world itself is asked, because a NaN can vanish on its way into a row: every comparison with it is
     false, and a `where` then takes the other case.
     """
     evader = _finite(world.evader)
@@ -44,8 +44,12 @@ def decide(
     hard: int,
     known: Bool[Array, "n *lanes"] | None = None,
 ) -> ShieldResult:
-    """The answer of a shield whose rows these are: the first `hard` of them before the others, none at all
-    unless `enforced`. `known` says of each whether it speaks of finite numbers; None asks the world."""
+    """The answer of a shield with these rows.
+
+    **Arguments:** `enforced`: whether the rows are kept at all; `hard` the number of leading rows that are
+    kept before the others; `known`: for each row, whether its robot and the evader are finite, by default
+    from the world.
+    """
     nominal = jnp.asarray(nominal, rows.values.dtype)
     known = known_parts(world) if known is None else known
     known &= jnp.isfinite(rows.values)
@@ -53,11 +57,11 @@ def decide(
         known &= jnp.isfinite(rows.offsets) & _finite(rows.normals, 1)
     finite = _finite(nominal)
     everything = fold(jnp.logical_and, known, True)
-    # With part of the world unknown nothing vouches for the nominal action.
-    vouched = stack(*(jnp.where(everything, component, 0.0) for component in nominal))
+    # With part of the world unknown the nominal action counts as a stop.
+    wanted = stack(*(jnp.where(everything, component, 0.0) for component in nominal))
     count = rows.offsets.shape[0] if enforced else 0
     projection = project(
-        vouched,
+        wanted,
         rows.normals[:count],
         jnp.where(known, rows.offsets, jnp.nan)[:count],
         scenario.evader_speed,
@@ -77,10 +81,8 @@ def decide(
 def correction(
     action: Float[AnyArray, "2 *lanes"], nominal: Float[AnyArray, "2 *lanes"]
 ) -> Float[Array, "*lanes"]:
-    """|action - nominal| in m/s, for components of `nominal` up to 1e15 m/s; larger ones count as that.
-
-    Beyond, the square of a command, and so every sum of corrections, would be infinite.
-    """
+    """|action - nominal| in m/s. Components of `nominal` beyond 1e15 m/s count as 1e15 m/s, because their
+    squares, and so every sum of corrections, would be infinite."""
     x, y = (new - jnp.clip(old, -1e15, 1e15) for new, old in zip(action, nominal, strict=True))
     return root(x * x + y * y)
 
@@ -88,7 +90,7 @@ def correction(
 def as_turned(
     result: ShieldResult, nominal: Float[AnyArray, "2 *lanes"], turn: Float[AnyArray, "*lanes"]
 ) -> ShieldResult:
-    """The answer for a nominal action that was turned aside, as one for the `nominal` action itself."""
+    """The answer to a nominal action that was turned aside (`turn` not 0), reported as one to `nominal`."""
     aside = turn != 0.0
     moved = correction(result.action, jnp.where(_finite(nominal), nominal, 0.0))
     return eqx.tree_at(
@@ -101,7 +103,12 @@ def as_turned(
     )
 
 
+def obstacle_rows(scenario: Scenario, world: World) -> BarrierRows:
+    """The rows of `ObstacleBarrier` towards all obstacles."""
+    barrier = ObstacleBarrier()
+    return barrier.rows(scenario, world, barrier.update_memories(scenario, world))
+
+
 def with_obstacles(towards_pursuers: BarrierRows, scenario: Scenario, world: World) -> BarrierRows:
-    """The rows, then those of `ObstacleBarrier` towards all obstacles."""
-    obstacle = ObstacleBarrier()
-    return compose(towards_pursuers, obstacle.rows(scenario, world, obstacle.remember(scenario, world)))
+    """The rows towards pursuers, then those of `ObstacleBarrier` towards all obstacles."""
+    return compose(towards_pursuers, obstacle_rows(scenario, world))

@@ -1,4 +1,4 @@
-"""A shield from a barrier of one's own."""
+"""A shield from a custom barrier."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from sidestep.world.state import World
 
 @final
 class BarrierShield(Shield):
-    """Keeps the rows of any barrier towards pursuers, before those towards obstacles when not all can hold.
+    """Keeps the rows of any barrier towards pursuers; they come before those towards obstacles where not all
+    are feasible.
 
-    It promises what the barriers do: in continuous time, where their rows can be kept. Make one with
-    `shield_of`, which looks at the barrier first.
+    It guarantees what the barriers do: in continuous time, where their rows are feasible. Make one with
+    `shield_of`, which probes the barrier first.
     """
 
     scenario: Scenario
@@ -29,34 +30,39 @@ class BarrierShield(Shield):
     towards_obstacles: Barrier = ObstacleBarrier()
 
     def init(self, world: World) -> Any:
-        kept = self.towards_pursuers, self.towards_obstacles
-        return tuple(barrier.remember(self.scenario, world) for barrier in kept)
+        return self._updated(world, (None, None))
 
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
     ) -> tuple[ShieldResult, Any]:
-        scenario, kept = self.scenario, (self.towards_pursuers, self.towards_obstacles)
-        memory = tuple(
-            barrier.remember(scenario, world, sides) for barrier, sides in zip(kept, memory, strict=True)
-        )
-        rows, hard = self.rows(world, memory), scenario.pursuer_count
-        return decide(scenario, world, nominal, rows, enforced=True, hard=hard), memory
+        memory, hard = self._updated(world, memory), self.scenario.pursuer_count
+        rows = self.rows(world, memory)
+        return decide(self.scenario, world, nominal, rows, enforced=True, hard=hard), memory
 
     def rows(self, world: World, memory: Any) -> BarrierRows:
-        kept = self.towards_pursuers, self.towards_obstacles
-        pairs = zip(kept, memory, strict=True)
-        return compose(*(barrier.rows(self.scenario, world, sides) for barrier, sides in pairs))
+        pairs = zip(self._kept, memory, strict=True)
+        return compose(*(barrier.rows(self.scenario, world, one) for barrier, one in pairs))
+
+    @property
+    def _kept(self) -> tuple[Barrier, Barrier]:
+        return self.towards_pursuers, self.towards_obstacles
+
+    def _updated(self, world: World, memory: Any) -> Any:
+        pairs = zip(self._kept, memory, strict=True)
+        return tuple(barrier.update_memories(self.scenario, world, one) for barrier, one in pairs)
 
 
 def shield_of(
     barrier: Barrier, scenario: Scenario, towards_obstacles: Barrier | None = None, *, probe: bool = True
 ) -> Shield:
-    """The shield that keeps `barrier` towards pursuers, and the obstacles' as ever or `towards_obstacles`.
+    """The shield that keeps `barrier` towards pursuers, and towards obstacles `ObstacleBarrier` or another.
 
-    **Raises** `ValueError` with all that `probe_barrier` finds wrong: shapes, numbers that are not finite, an
-    allowance that is not of class K through zero, a normal that is not the gradient or vanishes. **Warns**
-    `BarrierWarning` of what keeps it from guaranteeing anything: motions that its rate leaves out, rows that
-    nothing can keep. `probe=False` leaves the look out.
+    It works for custom robots too (`AdaptedShield`).
+
+    **Raises** `ValueError` with everything that `probe_barrier` finds wrong: wrong shapes, non-finite
+    numbers, an alpha that is not of class K, a normal that is not the gradient or vanishes. **Warns**
+    `BarrierWarning` where there is no guarantee: motions that the rate leaves out, rows that are infeasible.
+    `probe=False` skips the probe.
     """
     inner = of_control_point(scenario)
     if probe:

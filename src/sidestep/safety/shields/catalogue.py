@@ -42,22 +42,22 @@ PURSUIT_SHIELDS = tuple(name for name, kind in SHIELDS.items() if kind.keeps_pur
 def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> Shield:
     """The shield `name` (a key of `SHIELDS`) for a scenario; `budget` for `game` and `joint` only.
 
-    **Raises** `ValueError` naming the known shields, or what is wrong with the budget. **Warns**
-    `BudgetWarning` once where the budget is more than the game leaves, `ModelWarning` where robots of one's
-    own leave an evader that can be caught.
+    For custom robots (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
 
-    With robots of one's own (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
+    **Raises** `ValueError` naming the known shields, or what is wrong with the budget. **Warns**
+    `BudgetWarning` where the budget exceeds what the game allows, `ModelWarning` where custom robots leave an
+    evader that can be captured.
     """
     if name not in SHIELDS:
         raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS))}")
     if not scenario.built_in:
-        guarded = of_control_point(scenario)
+        covering = of_control_point(scenario)
         if name in PURSUIT_SHIELDS:
-            guarded = covered(guarded)
-            _announce_beyond(guarded)
-        else:  # The others say nothing of what a pursuer can do.
-            guarded = dataclasses.replace(guarded, pursuer_model=None)
-        return AdaptedShield(scenario, make_shield(name, guarded, budget))
+            covering = covered(covering)
+            _announce_beyond(covering)
+        else:  # The others assume nothing about the pursuer's motion.
+            covering = dataclasses.replace(covering, pursuer_model=None)
+        return AdaptedShield(scenario, make_shield(name, covering, budget))
     if budget is not None:
         if name not in PURSUIT_SHIELDS:
             raise ValueError(
@@ -69,13 +69,13 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     return JointShield(scenario, budget=budget) if name == "joint" else SHIELDS[name](scenario)
 
 
-def _announce_beyond(guarded: Scenario) -> None:
-    """Warn where a pursuer wins against the problem that covers that of robots of one's own."""
-    if traced(guarded):
+def _announce_beyond(covering: Scenario) -> None:
+    """Warn where the pursuer wins the game that covers that of custom robots."""
+    if traced(covering):
         return
-    allowed, kept = float(CaptureGame.of(guarded).largest_capture_distance), float(guarded.capture_distance)
+    allowed, kept = float(CaptureGame.of(covering).largest_capture_distance), float(covering.capture_distance)
     if kept > allowed:
-        speed, axle = float(guarded.pursuer_speed), float(guarded.pursuer_half_axle)
+        speed, axle = float(covering.pursuer_speed), float(covering.pursuer_half_axle)
         warnings.warn(
             f"with these robots the evader's control point has to keep {kept:.3g} m away from a drive of rim "
             f"speed {speed:.3g} m/s and half axle {axle:.3g} m, and against a good one {allowed:.3g} m is "
@@ -87,7 +87,7 @@ def _announce_beyond(guarded: Scenario) -> None:
 
 
 def as_shield(shield: str | Shield | Barrier, scenario: Scenario) -> Shield:
-    """`shield` itself, the one of that name for `scenario`, or the one that keeps a barrier of one's own."""
+    """`shield` itself, or the one of that name for `scenario`, or the one that keeps a custom barrier."""
     if isinstance(shield, Barrier):
         return shield_of(shield, scenario)
     return make_shield(shield, scenario) if isinstance(shield, str) else shield

@@ -1,44 +1,57 @@
-"""Where does the way out that `joint` counts on lead?"""
+"""What is an escape plan? A nominal velocity for each of a few segments of time.
 
-from collections.abc import Callable
-from typing import Any
+The evader does not drive these velocities themselves. Each one passes through the rows of the `game` shield,
+pursuers first.
+"""
 
-import equinox as eqx
-import jax
+from __future__ import annotations
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from sidestep._arrays import Scalar
-from sidestep.pursuit import make_pursuer, pursue
-from sidestep.safety.shields.look_ahead import WayOut, moved, stretch, wish
+from sidestep._arrays import Count, Lanes, Scalar, stack
+from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
-_PLAN_POINTS = 33
+HEADINGS = 16
+"""Number of world headings, evenly spread, among the choices."""
+CHOICES = HEADINGS + 4
+"""Number of choices: the headings; away from the pursuer; left and right of its axis; a stop."""
+SEGMENTS = 4
+"""Number of segments in a plan."""
+
+EscapePlan = Int[Array, "segments"]
+"""The choice for each segment, 0 to `CHOICES` - 1."""
 
 
-def way_out(
-    scenario: Scenario,
-    guard: Callable[..., Any],
-    world: World,
-    sides: Float[Array, "m"],
-    way: WayOut,
-    age: Scalar,
-    horizon: Scalar,
-    acceleration: Scalar | None,
-) -> Float[Array, "n 2"]:
-    """Where (m) it leads within `horizon` (s) against a pursuer that plays `nash`. See `imagine`."""
-    pursuer, steps = make_pursuer("nash"), _PLAN_POINTS - 1
-    period = horizon / steps
-    paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, period)
+def chosen_velocity(
+    scenario: Scenario, world: World, sides: Float[Array, "m *lanes"], choice: Int[Array, "*lanes"]
+) -> Float[Array, "2 *lanes"]:
+    """Nominal velocity (m/s, world axes) of a choice in this world.
 
-    def step(carry: Any, count: Array) -> Any:
-        world, sides = carry
-        number = stretch(way, age + period * count, horizon / len(way))
-        action, sides = guard(world, wish(paced, world, sides, number), sides)
-        wheels = pursue(paced, pursuer, world, jax.random.key(0))
-        world = moved(paced, world, action, wheels, acceleration)
-        return (world, sides), world.evader
+    The last four choices are relative to the first pursuer and turn with it: along the normal of the pursuit
+    barrier, where the barrier grows fastest; left and right of the pursuer's axis, where the pursuer must
+    turn before it can drive; and a stop, which leaves the choice to the rows.
+    """
+    angle = 2.0 * jnp.pi * choice.astype(world.evader.dtype) / HEADINGS
+    fixed = jnp.cos(angle), jnp.sin(angle)
+    away, _ = PursuitBarrier().gradient_and_rate(scenario, world.evader, world.pursuer, sides[0])
+    heading = world.pursuer[2]
+    left = -jnp.sin(heading), jnp.cos(heading)
+    relative = choice - HEADINGS
+    sign = jnp.where(relative == 1, 1.0, -1.0).astype(away.dtype)
 
-    _, places = jax.lax.scan(step, (world, sides), jnp.arange(steps).astype(period.dtype))
-    return jnp.concatenate([world.evader[None], places])
+    def component(i: int) -> Lanes:
+        chosen = jnp.where(relative == 0, away[i], sign * left[i])
+        return jnp.where(relative < 0, fixed[i], jnp.where(relative == 3, 0.0, chosen))
+
+    return scenario.evader_speed * stack(component(0), component(1))
+
+
+def choice_at(plan: EscapePlan, age: Scalar, segment: Scalar) -> Count:
+    """The choice of a plan that has been followed for `age` (s), with segments of `segment` (s).
+
+    After the last segment its choice stays.
+    """
+    return plan[jnp.clip((age / segment).astype(jnp.int32), 0, SEGMENTS - 1)]

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray
+from sidestep._moved import renamed, renamed_arguments
 from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
-from sidestep.safety.barriers.sampling_margin import guarded, margins, sampling_margin
+from sidestep.safety.barriers.sampling_margin import margins, sampling_margin, with_margins
 from sidestep.safety.filter.projection import project_known
 from sidestep.safety.filter.status import Status
 from sidestep.safety.shields.answer import as_turned, decide, known_parts, with_obstacles
@@ -23,43 +24,44 @@ from sidestep.world.state import World
 
 
 class GameMemory(eqx.Module):
-    """What `game` keeps in mind: the `sides (m,)` of the pursuers' axes that its rows follow, and the
-    `turn ()` that leads it round an obstacle, see `going_round`."""
+    """What `game` keeps from call to call: the `sides (m,)` of the pursuers' axes that its rows follow, and
+    the `turn ()` that leads it round an obstacle, see `going_round`."""
 
     sides: Float[Array, "m *lanes"]
     turn: Float[Array, "*lanes"]
 
 
 @final
+@renamed_arguments(wish_picks_side="nominal_picks_side")
 class GameShield(Shield):
-    """`PursuitBarrier` towards pursuers, kept before the `ObstacleBarrier` rows when not all can hold.
+    """`PursuitBarrier` towards pursuers, then `ObstacleBarrier` towards obstacles. The pursuers' rows come
+    first where not all rows are feasible.
 
-    Against one pursuer in the unbounded plane, in continuous time and with l <= l_max, the pursuit row can
-    always be kept, and then there is no capture. Sampling, several pursuers and obstacles beside them are
-    outside that statement. For the pursuer's turns within a period the rows keep `sampling_margin` more than
-    the capture distance; the barriers that are reported are those of the capture distance itself.
+    For one pursuer in the unbounded plane, in continuous time and with l <= l_max, the pursuit row is always
+    feasible, and while it is kept there is no capture. Sampling, several pursuers and obstacles beside them
+    are outside that statement. The rows keep `sampling_margin` more than the capture distance, for what the
+    pursuer turns within a period. The reported barriers are those of the capture distance itself.
 
-    `known_velocity=True` is for a pursuer whose next wheel speeds are known, because it announces them or
-    they can be computed: whoever calls puts them into `world.wheel_speeds`. The rows are then those of
-    `PursuitBarrier.rows_over_period`, two for each pursuer, which need no margin and interfere less.
+    - `known_velocity=True`: the pursuers' next wheel speeds are known, because they are announced or can be
+      computed, and the caller puts them into `world.wheel_speeds`. The rows are then those of
+      `PursuitBarrier.rows_over_period`, two for each pursuer. They need no margin and interfere less.
+    - `nominal_picks_side=True`: the nominal action chooses the side of a pursuer's axis where both sides are
+      feasible, see `PursuitBarrier.choose_sides`.
+    - `budget`: the rows also keep what measurement, delay and motors may take, see `Budget`. If the budget
+      exceeds what the game allows, rows become infeasible. The violation is then minimised and retreat starts
+      earlier, so that the distance stays close to the best possible.
+    - `goes_round=True`, which `make_shield` sets: an evader that is stuck behind an obstacle goes round it,
+      see `going_round`. Rows and filter stay as they are; the nominal action is turned aside for a while. If
+      the scenario has obstacles the memory is then a `GameMemory`, otherwise only its `sides`.
 
-    `wish_picks_side=True` lets the nominal action choose the side of a pursuer's axis where either will do,
-    see `PursuitBarrier.prefer`.
-
-    With a `budget` the rows also keep what measurement, delay and motors may take, see `Budget`. One that is
-    more than the game leaves is kept as well as can be, as everything that cannot: the further out the rows
-    begin to ask for retreat, the closer the distance stays to the best that is possible.
-
-    With `goes_round=True`, which `make_shield` sets, an evader that is stuck behind an obstacle goes round it
-    (see `going_round`): rows and filter stay as they are, the nominal action is turned aside for a while.
-    Where the scenario has obstacles the memory is then a `GameMemory`, else only its `sides`.
+    **Raises** `ValueError` for `known_velocity` together with a budget.
     """
 
     keeps_pursuit_barrier = True
     scenario: Scenario
     budget: Budget | None = None
     known_velocity: bool = eqx.field(static=True, default=False)
-    wish_picks_side: bool = eqx.field(static=True, default=False)
+    nominal_picks_side: bool = eqx.field(static=True, default=False)
     goes_round: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
@@ -71,7 +73,7 @@ class GameShield(Shield):
         return not self.known_velocity
 
     def init(self, world: World) -> Any:
-        sides = PursuitBarrier().remember(self.scenario, world)
+        sides = PursuitBarrier().update_memories(self.scenario, world)
         return GameMemory(sides, jnp.zeros_like(world.evader[0])) if self._may_be_stuck else sides
 
     @property
@@ -83,7 +85,7 @@ class GameShield(Shield):
     ) -> tuple[ShieldResult, Any]:
         if not self._may_be_stuck:
             return self._filtered(world, nominal, memory)
-        kept = guarded(self.scenario, self.budget)
+        kept = with_margins(self.scenario, self.budget)
         nominal = jnp.asarray(nominal, world.evader.dtype)
         turn = still_turned(kept, world, nominal, memory.turn)
         result, sides = self._filtered(world, turned(nominal, turn), memory.sides)
@@ -101,7 +103,7 @@ class GameShield(Shield):
         if self.known_velocity:
             rows = PursuitBarrier().rows_over_period(self.scenario, world, sides)
             return with_obstacles(rows, self.scenario, world)
-        kept = guarded(self.scenario, self.budget)
+        kept = with_margins(self.scenario, self.budget)
         rows = with_obstacles(self._barrier.rows(kept, world, sides), kept, world)
         if self.budget is None:
             return rows
@@ -110,18 +112,18 @@ class GameShield(Shield):
 
     @property
     def _barrier(self) -> PursuitBarrier:
-        # Where the margin has been used up the row still holds what is left, and asks for no more. Not so
-        # with the budget's: errors push inwards again and again, and the row leads back out.
+        # Where the sampling margin is spent, the row holds what is left and does not lead back out. Where the
+        # budget is spent it does lead out: errors push inwards again and again.
         return PursuitBarrier(eased=sampling_margin(self.scenario), budget=self.budget)
 
     def _next_sides(self, world: World, nominal: Any, sides: Any) -> Float[Array, "m *lanes"]:
         """The sides of the pursuers' axes that the rows follow now."""
         if self.known_velocity:
-            return PursuitBarrier().remember(self.scenario, world, sides)
-        kept = guarded(self.scenario, self.budget)
-        if self.wish_picks_side:
-            return self._barrier.prefer(kept, world, sides, nominal)
-        return self._barrier.remember(kept, world, sides)
+            return PursuitBarrier().update_memories(self.scenario, world, sides)
+        kept = with_margins(self.scenario, self.budget)
+        if self.nominal_picks_side:
+            return self._barrier.choose_sides(kept, world, sides, nominal)
+        return self._barrier.update_memories(kept, world, sides)
 
     def _filtered(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], sides: Float[AnyArray, "m *lanes"]
@@ -139,18 +141,17 @@ class GameShield(Shield):
         rows = eqx.tree_at(lambda rows: rows.values, rows, values)
         return decide(self.scenario, world, nominal, rows, enforced=True, hard=m), sides
 
-    def heed(
-        self, world: World, wish: Float[Array, "2 *lanes"], sides: Float[Array, "m *lanes"]
+    def filter_unchecked(
+        self, world: World, nominal: Float[Array, "2 *lanes"], sides: Float[Array, "m *lanes"]
     ) -> tuple[Float[Array, "2 *lanes"], Float[Array, "m *lanes"]]:
-        """The action (m/s) alone, and the next memory, for a finite world and a wish within the speed limit.
+        """The action (m/s) and the next sides, for a finite world and a nominal action within the limit.
 
-        The same as calling the shield, without what it takes to be sure of its input and to report: for
-        chases that are only imagined.
+        It is the action of the call, without checks of the input and without a report: for imagined chases.
         """
-        sides = self._next_sides(world, wish, sides)
+        sides = self._next_sides(world, nominal, sides)
         rows = self._rows(world, sides)
         action = project_known(
-            wish,
+            nominal,
             rows.normals,
             rows.offsets,
             self.scenario.evader_speed,
@@ -158,3 +159,5 @@ class GameShield(Shield):
             circle=self.scenario.action == "heading",
         )
         return action, sides
+
+    heed = renamed(filter_unchecked, "heed")

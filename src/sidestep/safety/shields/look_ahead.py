@@ -1,8 +1,7 @@
-"""Imagined chases: what becomes of a way out if it is followed, against several pursuers at once.
+"""What becomes of an escape plan? Imagined chases against several models of the pursuers at once.
 
-A *way out* is a wished velocity for each of a few stretches of time; what the evader then drives is the
-wish passed through the rows of the `game` shield, pursuers first. So an imagined chase keeps from capture
-as the real one does, and what remains to be seen is whether obstacles stay clear too.
+The imagined evader drives what the rows of the `game` shield let through, as the real one does. So the rows
+keep it from capture, and the look-ahead has to find out whether obstacles stay clear too.
 """
 
 from __future__ import annotations
@@ -15,50 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sidestep._arrays import Count, Lanes, Scalar, length, stack
-from sidestep.pursuit import Pursuer, pursue
-from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
+from sidestep._arrays import Lanes, Scalar, length, stack
+from sidestep.pursuit import Pursuer, make_pursuer, pursue
+from sidestep.safety.shields.escape_plan import SEGMENTS, EscapePlan, choice_at, chosen_velocity
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
-HEADINGS = 16
-"""World headings, evenly spread, that may be wished."""
-WISHES = HEADINGS + 4
-"""Wishes: the headings; then away from the pursuer, to either side of its axis, and a stop."""
-STRETCHES = 4
-"""Stretches of time in a way out, each with a wish of its own."""
-
-WayOut = Int[Array, "stretches"]
-"""The wish of each stretch, by number."""
-
-
-def wish(
-    scenario: Scenario, world: World, sides: Float[Array, "m *lanes"], number: Int[Array, "*lanes"]
-) -> Float[Array, "2 *lanes"]:
-    """Velocity (m/s, world axes) of wish `number` in this world.
-
-    The last four are relative to the first pursuer and turn as it turns: along the pursuit barrier's normal,
-    which is how the clearance grows fastest; to the left and to the right of its axis, where it must turn
-    before it can drive; and a stop, which leaves the choice to the rows.
-    """
-    angle = 2.0 * jnp.pi * number.astype(world.evader.dtype) / HEADINGS
-    held = jnp.cos(angle), jnp.sin(angle)
-    away, _ = PursuitBarrier().approach(scenario, world.evader, world.pursuer, sides[0])
-    heading = world.pursuer[2]
-    left = -jnp.sin(heading), jnp.cos(heading)
-    relative = number - HEADINGS
-    sign = jnp.where(relative == 1, 1.0, -1.0).astype(away.dtype)
-
-    def component(i: int) -> Lanes:
-        chosen = jnp.where(relative == 0, away[i], sign * left[i])
-        return jnp.where(relative < 0, held[i], jnp.where(relative == 3, 0.0, chosen))
-
-    return scenario.evader_speed * stack(component(0), component(1))
-
-
-def stretch(way: WayOut, age: Scalar, length: Scalar) -> Count:
-    """The wish of a way out that has been followed for `age` (s); its last one from then on."""
-    return way[jnp.clip((age / length).astype(jnp.int32), 0, STRETCHES - 1)]
+_PATH_POINTS = 33
 
 
 def clearance(scenario: Scenario, world: World) -> Lanes:
@@ -78,12 +40,14 @@ def ramp(
     acceleration: Scalar,
     period: Scalar,
 ) -> tuple[Float[Array, "2 *lanes"], Float[Array, "2 *lanes"]]:
-    """Mean velocity in a period and velocity at its end (m/s) of a robot that goes from `velocity` straight
-    to `wanted` at `acceleration` (m/s^2)."""
+    """A robot changes its velocity from `velocity` straight to `wanted` at `acceleration` (m/s^2).
+
+    **Returns** its mean velocity in the period and its velocity at the end, m/s.
+    """
     lacking_x, lacking_y = wanted[0] - velocity[0], wanted[1] - velocity[1]
     gained, lacking = acceleration * period, length(lacking_x, lacking_y)
     end = jnp.where(lacking > gained, gained / jnp.where(lacking > gained, lacking, 1.0), 1.0)
-    # The time that it takes, at most the whole period, is spent half-way between, the rest at the end.
+    # While it changes, at most for the whole period, the mean is half-way; after that, the end velocity.
     mean = end * (1.0 - 0.5 * jnp.minimum(lacking / gained, 1.0))
     return (
         stack(velocity[0] + mean * lacking_x, velocity[1] + mean * lacking_y),
@@ -98,8 +62,11 @@ def moved(
     wheels: Float[Array, "m 2 *lanes"],
     acceleration: Scalar | None,
 ) -> World:
-    """`scenario.moved` of a robot that drives `velocity` at once, or else as its `acceleration` (m/s^2) lets
-    it get there from `world.evader_velocity`."""
+    """The world one control period later.
+
+    With `acceleration` (m/s^2) the evader starts from `world.evader_velocity` and needs time to reach
+    `velocity` (m/s); with None it drives `velocity` at once.
+    """
     if acceleration is None:
         return scenario.moved(world, velocity, wheels)
     mean, end = ramp(world.evader_velocity, velocity, acceleration, scenario.control_period)
@@ -107,8 +74,11 @@ def moved(
 
 
 class Outlook(eqx.Module):
-    """What becomes of imagined chases: time (s) until the first contact, all of it where there is none, and
-    the smallest clearance (m) on the way, that of the start left out."""
+    """Result of imagined chases.
+
+    - `time` s until the first contact; the whole time where there is none
+    - `least` m, the smallest clearance on the way, without that of the start
+    """
 
     time: Float[Array, "models n"]
     least: Float[Array, "models n"]
@@ -120,29 +90,32 @@ def imagine(
     models: Sequence[Pursuer],
     worlds: World,
     sides: Float[Array, "m models n"],
-    ways: Int[Array, "n stretches"],
+    plans: Int[Array, "n segments"],
     ages: Float[Array, "n"],
-    length: Scalar,
+    segment: Scalar,
     steps: int,
     acceleration: Scalar | None = None,
 ) -> Outlook:
-    """What becomes of ways out when they are followed for `steps` of the scenario's control periods.
+    """Follow n escape plans for `steps` control periods of `scenario`, each against every model.
 
-    **Arguments:** `guard(world, wish, sides) -> (action, sides)`, the rows; `worlds` and `sides` with axes
-    (models, n) behind their own, model i driving the pursuers of `worlds[..., i, :]`; `ways` the way out
-    followed in each, `ages` how long (s) it has been followed already, `length` of its stretches (s);
-    `acceleration` (m/s^2) of the evader's motors, None: they follow at once.
+    **Arguments:**
+
+    - `guard(world, nominal, sides) -> (action, sides)` the rows
+    - `worlds`, `sides` with axes (models, n) behind their own; model i drives the pursuers of
+      `worlds[..., i, :]`
+    - `ages` s, how long each plan has been followed already; `segment` s, the length of its segments
+    - `acceleration` m/s^2 of the evader's motors; None: the evader reaches every velocity at once
     """
     key = jax.random.key(0)  # the models do not draw
-    lanes = (len(models), len(ways))
+    lanes = (len(models), len(plans))
 
     period = scenario.control_period
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
         worlds, sides, ages, outlook = carry
-        numbers = jax.vmap(stretch, in_axes=(0, 0, None))(ways, ages, length)
-        wished = wish(scenario, worlds, sides, jnp.broadcast_to(numbers, lanes))
-        actions, sides = guard(worlds, wished, sides)
+        choices = jax.vmap(choice_at, in_axes=(0, 0, None))(plans, ages, segment)
+        nominal = chosen_velocity(scenario, worlds, sides, jnp.broadcast_to(choices, lanes))
+        actions, sides = guard(worlds, nominal, sides)
         each = [jax.tree.map(lambda leaf, i=i: leaf[..., i, :], worlds) for i in range(len(models))]
         wheels = jnp.stack(
             [pursue(scenario, model, world, key) for model, world in zip(models, each, strict=True)], axis=-2
@@ -155,3 +128,33 @@ def imagine(
     begin = Outlook(jnp.zeros(lanes, ages.dtype), jnp.full(lanes, jnp.inf, ages.dtype))
     (_, _, _, outlook), _ = jax.lax.scan(step, (worlds, sides, ages, begin), length=steps)
     return outlook
+
+
+def path(
+    scenario: Scenario,
+    guard: Callable[..., Any],
+    world: World,
+    sides: Float[Array, "m"],
+    plan: EscapePlan,
+    age: Scalar,
+    horizon: Scalar,
+    acceleration: Scalar | None,
+) -> Float[Array, "n 2"]:
+    """Positions (m) of an evader that follows one escape plan for `horizon` (s), the present one first.
+
+    The pursuers play `nash`. Other arguments as for `imagine`.
+    """
+    pursuer, steps = make_pursuer("nash"), _PATH_POINTS - 1
+    period = horizon / steps
+    paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, period)
+
+    def step(carry: Any, count: Array) -> Any:
+        world, sides = carry
+        choice = choice_at(plan, age + period * count, horizon / SEGMENTS)
+        action, sides = guard(world, chosen_velocity(paced, world, sides, choice), sides)
+        wheels = pursue(paced, pursuer, world, jax.random.key(0))
+        world = moved(paced, world, action, wheels, acceleration)
+        return (world, sides), world.evader
+
+    _, positions = jax.lax.scan(step, (world, sides), jnp.arange(steps).astype(period.dtype))
+    return jnp.concatenate([world.evader[None], positions])

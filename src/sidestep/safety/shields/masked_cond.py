@@ -1,4 +1,4 @@
-"""A computation that is run only where it is needed, also under `jax.vmap`."""
+"""A conditional that also saves work under `jax.vmap`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,19 +10,20 @@ from jax.custom_batching import custom_vmap
 from sidestep._arrays import Flag
 
 
-def by_need(
+def masked_cond(
     function: Callable[..., Any], need: Flag, otherwise: Any, *arguments: Any, width: int = 16
 ) -> Any:
     """`function(*arguments)` where `need`, else `otherwise`.
 
-    Alone it is a conditional. Under `vmap`, where a conditional runs both branches for every element, the
-    elements in need are gathered and computed `width` at a time, so that the cost follows their number.
+    Without `vmap` this is `jax.lax.cond`. Under `vmap`, where a conditional runs both branches for every
+    element, the elements in need are gathered and computed `width` at a time. So the cost follows their
+    number.
 
-    **Arguments:** `otherwise` a pytree of the shapes and types that `function` returns; `arguments` pytrees
-    of arrays. `function` must close over no traced array. Carries no derivatives.
+    **Arguments:** `need ()`; `otherwise` a pytree with the shapes and types that `function` returns;
+    `arguments` pytrees of arrays. `function` must close over no traced array. Carries no derivatives.
     """
 
-    # Lists of arrays, so that what is batched can be told leaf by leaf.
+    # As lists of arrays, because `batched` below speaks of each leaf.
     values, build_values = jax.tree.flatten(arguments)
     defaults, build_result = jax.tree.flatten(otherwise)
 

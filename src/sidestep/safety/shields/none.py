@@ -16,10 +16,9 @@ from sidestep.world.state import World
 
 @final
 class NoShield(Shield):
-    """Executes the nominal action as it is, cut to the speed limit; reports distances as barriers.
+    """Cuts the nominal action to the speed limit and changes nothing else; reports distances as barriers.
 
-    Status `OK` or `CORRECTED` (by the speed limit), or `INVALID` and a stop for a non-finite action or
-    world.
+    Status `OK`, `CORRECTED` (by the speed limit), or `INVALID` and a stop for a non-finite action or world.
     """
 
     scenario: Scenario
@@ -29,7 +28,7 @@ class NoShield(Shield):
         return True
 
     def init(self, world: World) -> Any:
-        return RangeBarrier().remember(self.scenario, world)
+        return RangeBarrier().update_memories(self.scenario, world)
 
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any

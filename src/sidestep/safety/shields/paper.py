@@ -18,8 +18,8 @@ from sidestep.world.state import World
 class PaperShield(Shield):
     """The paper's shield: `RangeBarrier` towards pursuers, `ObstacleBarrier` towards obstacles.
 
-    Kept as the baseline. Its pursuer row cannot always be kept (see `RangeBarrier`); then the answer
-    violates the pursuers' rows least, and the obstacles' rows least after that.
+    Kept as the baseline. Its pursuer row is not always feasible (see `RangeBarrier`). Then the answer
+    violates the pursuers' rows least, and after that the obstacles' rows least.
     """
 
     scenario: Scenario
@@ -29,7 +29,7 @@ class PaperShield(Shield):
         return True
 
     def init(self, world: World) -> Any:
-        return RangeBarrier().remember(self.scenario, world)
+        return RangeBarrier().update_memories(self.scenario, world)
 
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any

@@ -166,5 +166,5 @@ def _rows(scenario: Scenario, shield: Shield, world: World, memory: Any) -> Barr
     rows, barrier = shield.rows(world, memory), PursuitBarrier()
     if rows is not None:
         return rows
-    towards_pursuers = barrier.rows(scenario, world, barrier.remember(scenario, world))
+    towards_pursuers = barrier.rows(scenario, world, barrier.update_memories(scenario, world))
     return with_obstacles(towards_pursuers, scenario, world)
