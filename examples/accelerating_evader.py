@@ -1,4 +1,4 @@
-"""An evader of one's own: it has mass, so that it cannot change its velocity at once."""
+"""A custom evader: it has mass, so that it cannot change its velocity at once."""
 
 import jax.numpy as jnp
 
@@ -7,7 +7,7 @@ from sidestep.world import EvaderModel, EvaderState
 
 
 class Accelerating(EvaderModel):
-    """A double integrator whose controller runs up to the velocity it is told with time constant tau, chosen
+    """A double integrator whose controller reaches the commanded velocity with time constant tau, chosen
     so that it never asks for more than the greatest acceleration: |u - v|/tau <= 2 v_e/tau."""
 
     most: float = 4.0  # m/s^2
@@ -21,7 +21,7 @@ class Accelerating(EvaderModel):
         position = robot.position + command * time + excess * tau * (1.0 - left)
         return EvaderState(position, command + excess * left, robot.state)
 
-    # q = p + tau v moves as told: q' = v + (u - v) = u.
+    # q = p + tau v moves as commanded: q' = v + (u - v) = u.
     def control_point(self, scenario, robot):
         return robot.position + self.lag(scenario) * robot.velocity
 

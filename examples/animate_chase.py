@@ -1,4 +1,4 @@
-"""A chase with a robot of one's own, as an animation: python examples/animate_chase.py unicycle chase.webp"""
+"""A chase with a custom robot, as an animation: python examples/animate_chase.py unicycle chase.webp"""
 
 import sys
 import tempfile

@@ -1,4 +1,4 @@
-"""A pursuer of one's own: a car, which cannot turn on the spot, and its barrier, solved on a grid."""
+"""A custom pursuer: a car, which cannot turn on the spot, and its barrier, solved on a grid."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""The shield in a control loop of one's own: poses and a wish in, a safe velocity out."""
+"""The shield in your control loop: poses and a nominal velocity in, a safe velocity out."""
 
 import math
 
@@ -11,7 +11,7 @@ settings = OnboardSettings(budget=Budget(position_error=0.003), position_noise=0
 onboard = Onboard(scenario, "game", settings=settings)
 onboard.warm_up()
 
-# Stands for the robots: the evader is told to drive straight at a pursuer that drives straight at it.
+# Stands for the robots: the evader is commanded to drive straight at a pursuer that drives straight at it.
 evader, pursuer, period = [0.0, 0.0], [1.2, 0.0], float(scenario.control_period)
 for count in range(120):
     now = count * period

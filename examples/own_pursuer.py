@@ -1,4 +1,4 @@
-"""A pursuer of one's own: it guards the target and strikes when the evader comes near."""
+"""A custom pursuer: it guards the target and strikes when the evader comes near."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""An evader of one's own: a unicycle, which cannot move sideways."""
+"""A custom evader: a unicycle, which cannot move sideways."""
 
 import jax
 import jax.numpy as jnp
