@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.specifiers import SpecifierSet
 
 import sidestep
@@ -102,8 +103,36 @@ def test_every_dependency_has_a_lower_and_an_upper_bound():
 
 
 def test_versions_agree():
-    assert f"version: {sidestep.__version__}\n" in text("CITATION.cff")
-    assert f"dist/sidestep-{sidestep.__version__}-py3-none-any.whl" in text("docs/start.md")
+    version = sidestep.__version__
+    assert f"version: {version}\n" in text("CITATION.cff")
+    assert f"dist/sidestep-{version}-py3-none-any.whl" in text("docs/start.md")
+    assert f'version="{version}"' in text("ros2/sidestep_ros/setup.py")
+    assert f"<version>{version}</version>" in text("ros2/sidestep_ros/package.xml")
+
+
+def test_the_hooks_and_make_check_run_the_same_programs_of_the_environment():
+    hooks = yaml.safe_load(text(".pre-commit-config.yaml"))["repos"]
+    assert [repo["repo"] for repo in hooks] == ["local"]  # from elsewhere they would be downloaded
+    checks = text("Makefile").partition("\ncheck:")[2].partition("\n\n")[0]
+    for hook in hooks[0]["hooks"]:
+        program = re.match(r"\.venv/bin/(?:python -m )?([\w-]+)", hook["entry"])[1]
+        assert program in checks or program == "pytest", hook["id"]
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml")), ids=lambda path: path.stem
+)
+def test_issue_templates_are_forms(path):
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if path.stem == "config":
+        assert set(form) <= {"blank_issues_enabled", "contact_links"}
+        return
+    assert {"name", "description", "body"} <= set(form)
+    names = [field["id"] for field in form["body"]]
+    assert len(names) == len(set(names))
+    for field in form["body"]:
+        assert field["type"] in {"textarea", "input", "dropdown", "checkboxes"}
+        assert field["attributes"]["label"]
 
 
 @pytest.mark.parametrize("module", ["sidestep", "sidestep.cli", "sidestep.trials"])
