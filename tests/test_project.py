@@ -6,11 +6,13 @@ import re
 import subprocess
 import sys
 import tomllib
+from datetime import date
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
+from packaging.version import Version
 
 import sidestep
 from sidestep.learning import make_options, options_to_dict
@@ -108,6 +110,22 @@ def test_versions_agree():
     assert f"dist/sidestep-{version}-py3-none-any.whl" in text("docs/start.md")
     assert f'version="{version}"' in text("ros2/sidestep_ros/setup.py")
     assert f"<version>{version}</version>" in text("ros2/sidestep_ros/package.xml")
+
+
+def test_the_changelog_has_a_dated_section_per_version_and_a_short_line_per_change():
+    log = text("CHANGELOG.md")
+    sections = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - (unreleased|\d{4}-\d{2}-\d{2})$", log, re.MULTILINE)
+    assert len(sections) == len(re.findall(r"^## ", log, re.MULTILINE))
+    versions, days = [Version(version) for version, _ in sections], [day for _, day in sections]
+    assert versions == sorted(set(versions), reverse=True)
+    assert "unreleased" not in days[1:]
+    released = [day for day in days if day != "unreleased"]
+    assert [str(date.fromisoformat(day)) for day in released] == sorted(released, reverse=True)
+    assert sidestep.__version__ == str(versions[len(days) - len(released)])
+    kinds = "|".join(("Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"))
+    for line in log.partition("\n## ")[2].splitlines()[1:]:
+        assert re.fullmatch(rf"|- .+\.|## .+|### (?:{kinds})|#### .+", line), line
+        assert len(line) < 120, line
 
 
 def test_the_hooks_and_make_check_run_the_same_programs_of_the_environment():
