@@ -1,4 +1,4 @@
-"""A custom evader: it has mass, so that it cannot change its velocity at once."""
+"""A custom evader with mass, which cannot change its velocity at once."""
 
 import jax.numpy as jnp
 
@@ -7,8 +7,8 @@ from sidestep.world import EvaderModel, EvaderState
 
 
 class Accelerating(EvaderModel):
-    """A double integrator whose controller reaches the commanded velocity with time constant tau, chosen
-    so that it never asks for more than the greatest acceleration: |u - v|/tau <= 2 v_e/tau."""
+    """A double integrator whose controller approaches the commanded velocity with time constant tau. Tau is
+    chosen so that the acceleration limit is never exceeded: |u - v|/tau <= 2 v_e/tau."""
 
     most: float = 4.0  # m/s^2
 
@@ -21,7 +21,7 @@ class Accelerating(EvaderModel):
         position = robot.position + command * time + excess * tau * (1.0 - left)
         return EvaderState(position, command + excess * left, robot.state)
 
-    # q = p + tau v moves as commanded: q' = v + (u - v) = u.
+    # q = p + tau v moves exactly as commanded: q' = v + (u - v) = u.
     def control_point(self, scenario, robot):
         return robot.position + self.lag(scenario) * robot.velocity
 

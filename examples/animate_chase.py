@@ -11,7 +11,7 @@ from unicycle_evader import Unicycle
 import sidestep
 from sidestep.views import animate
 
-# What is other than in the paper's test scene, the pursuer's strategy, and how many times as fast to play it.
+# Changes to the paper's test scene, the pursuer's strategy, and the playback speed (times real speed).
 CHASES = {
     "car": ({"pursuer_model": Car(), "capture_distance": 0.15}, "chauffeur", 3.0),
     "unicycle": ({"evader_model": Unicycle(), "capture_distance": 0.17}, "nash", 9.0),

@@ -3,7 +3,7 @@
 import sidestep
 from sidestep.safety import certify
 
-# What the robots can do, and how well and how often ours sees and decides.
+# What the robots can do; position error, delay and control period are those of our robot.
 scenario = sidestep.load_scenario(
     "paper",
     evader_speed=0.3,  # m/s

@@ -1,4 +1,4 @@
-"""The shield in your control loop: poses and a nominal velocity in, a safe velocity out."""
+"""The shield in your own control loop: poses and a nominal velocity in, a safe velocity out."""
 
 import math
 
@@ -11,7 +11,7 @@ settings = OnboardSettings(budget=Budget(position_error=0.003), position_noise=0
 onboard = Onboard(scenario, "game", settings=settings)
 onboard.warm_up()
 
-# Stands for the robots: the evader is commanded to drive straight at a pursuer that drives straight at it.
+# Stands for the robots: the nominal velocity points straight at a pursuer that drives straight at the evader.
 evader, pursuer, period = [0.0, 0.0], [1.2, 0.0], float(scenario.control_period)
 for count in range(120):
     now = count * period
@@ -23,6 +23,6 @@ for count in range(120):
     if count % 20 == 0:
         x, y = decision.velocity
         apart = math.hypot(pursuer[0] - evader[0], pursuer[1] - evader[1])
-        print(f"{now:4.1f} s: {apart:.3f} m apart, told ({x:+.3f}, {y:+.3f}) m/s, {decision.level}")
+        print(f"{now:4.1f} s: {apart:.3f} m apart, commanded ({x:+.3f}, {y:+.3f}) m/s, {decision.level}")
     evader = [evader[0] + period * decision.velocity[0], evader[1] + period * decision.velocity[1]]
     pursuer[0] -= period * 0.2

@@ -9,7 +9,7 @@ scenario = sidestep.load_scenario("paper", evader_speed=0.16, obstacle_count=2)
 shield = sidestep.make_shield("game", scenario)
 pursuer = sidestep.make_pursuer("nash")
 
-# One control step by hand: the shield corrects what we would like to do, then everything moves.
+# One control step by hand: the shield corrects the nominal velocity, then everything moves.
 world = scenario.reset(jax.random.key(0))
 memory = shield.init(world)
 result, memory = shield(world, jnp.array([0.16, 0.0]), memory)

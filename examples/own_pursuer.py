@@ -10,7 +10,7 @@ nash = sidestep.make_pursuer("nash")
 
 
 def guard(scenario, world, key):
-    """Wheel speeds (left, right) in m/s from all that there is to see; the pursuer itself comes first."""
+    """Wheel speeds (left, right) in m/s from the whole world; the pursuer's own pose comes first."""
     pose = world.pursuers[0]
     way = world.target - pose[:2]
     off = jnp.arctan2(way[1], way[0]) - pose[2]

@@ -8,8 +8,8 @@ from sidestep.world import EvaderModel, EvaderState
 
 
 class Unicycle(EvaderModel):
-    """Told a velocity u, it drives the point d ahead of its axle with u: v = u.e, omega = u.e'/d with e along
-    and e' across its heading. The angle phi from u to its heading then obeys phi' = -(|u|/d) sin phi."""
+    """The point d ahead of the axle moves with the commanded velocity u: v = u.e, omega = u.e'/d, e along
+    and e' across the heading. The angle phi from u to the heading then obeys phi' = -(|u|/d) sin phi."""
 
     ahead: float = 0.02  # d, m
 

@@ -153,6 +153,12 @@ def test_issue_templates_are_forms(path):
         assert field["attributes"]["label"]
 
 
+def test_every_page_but_those_that_are_included_is_in_the_navigation():
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("[!_]*.md")}
+    listed = re.findall(r"^ +- [^:]+: ([\w/]+\.md)$", text("mkdocs.yml"), re.MULTILINE)
+    assert sorted(listed) == sorted(pages)
+
+
 @pytest.mark.parametrize("module", ["sidestep", "sidestep.cli", "sidestep.trials"])
 def test_import_needs_nothing_optional(module):
     optional = [
