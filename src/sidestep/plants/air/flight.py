@@ -87,14 +87,10 @@ class Flight(Bodies):
         super().__init__(scenario, options, seed, xml)
         height = options.height
         self.look = Look(height, height, (height, _TRAIL), 1.5 * height, _TILT, _NEAR)
-        find, kinds = self._mujoco.mj_name2id, self._mujoco.mjtObj
-        self._body = find(self.model, kinds.mjOBJ_BODY, "quadrotor")
-        self._motors = [find(self.model, kinds.mjOBJ_ACTUATOR, name) for name in ROTORS]
-        names = [
-            f"{kind}{i}" for kind, n in zip(("pursuer", "obstacle"), counts, strict=True) for i in range(n)
-        ]
-        bodies = [find(self.model, kinds.mjOBJ_BODY, name) for name in names]
-        self._mocap = [int(self.model.body_mocapid[body]) for body in bodies]
+        self._body = int(self.model.body("quadrotor").id)
+        self._motors = [int(self.model.actuator(name).id) for name in ROTORS]
+        names = [f"pursuer{i}" for i in range(counts[0])] + [f"obstacle{i}" for i in range(counts[1])]
+        self._mocap = [int(self.model.body(name).mocapid[0]) for name in names]
         self._ticks = round(options.autopilot_period / options.physics_step)
         model = scenario.evader_model
         assert isinstance(model, Quadrotor)

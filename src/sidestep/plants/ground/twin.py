@@ -24,32 +24,28 @@ _COLOURS = ("#0072B2", "#D55E00", "#595959")
 class _Places:
     """Where in MuJoCo's state each robot is found."""
 
-    def __init__(self, mujoco: Any, model: Any, base: str, pursuers: int, obstacles: int):
-        def joint(name: str) -> int:
-            return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-
-        def motor(name: str) -> int:
-            return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+    def __init__(self, model: Any, base: str, pursuers: int, obstacles: int):
+        def motors(*names: str) -> list[int]:
+            return [int(model.actuator(name).id) for name in names]
 
         def position(name: str) -> int:
-            return int(model.jnt_qposadr[joint(name)])
+            return int(model.joint(name).qposadr[0])
 
         def velocity(name: str) -> int:
-            return int(model.jnt_dofadr[joint(name)])
+            return int(model.joint(name).dofadr[0])
 
         self.floating = base != "servo"
         self.evader = position("evader" if self.floating else "evader_x")
         self.evader_velocity = velocity("evader" if self.floating else "evader_x")
         names = [f"wheel{index}" for index in range(3)] if self.floating else ["x", "y", "yaw"]
-        self.evader_motors = [motor(f"evader_{name}") for name in names]
+        self.evader_motors = motors(*(f"evader_{name}" for name in names))
         self.pursuers = [position(f"pursuer{i}") for i in range(pursuers)]
-        self.pursuer_velocities = [velocity(f"pursuer{i}") for i in range(pursuers)]
         sides = [[f"pursuer{i}_left", f"pursuer{i}_right"] for i in range(pursuers)]
         self.wheels = [[velocity(name) for name in pair] for pair in sides]
-        self.wheel_motors = [[motor(name) for name in pair] for pair in sides]
+        self.wheel_motors = [motors(*pair) for pair in sides]
         self.obstacles = [position(f"obstacle{i}_x") for i in range(obstacles)]
         self.obstacle_velocities = [velocity(f"obstacle{i}_x") for i in range(obstacles)]
-        self.obstacle_motors = [[motor(f"obstacle{i}_{axis}") for axis in "xy"] for i in range(obstacles)]
+        self.obstacle_motors = [motors(f"obstacle{i}_x", f"obstacle{i}_y") for i in range(obstacles)]
 
 
 def _heading(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n"]:
@@ -87,7 +83,7 @@ class Twin(Bodies):
             colours=_COLOURS,
         )
         super().__init__(scenario, options, seed, xml)
-        self._places = _Places(self._mujoco, self.model, options.base, *counts)
+        self._places = _Places(self.model, options.base, *counts)
         self._top = float(scenario.pursuer_speed)
 
     def _begin(self, world: World, root: np.random.Generator) -> None:
