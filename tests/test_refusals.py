@@ -1,5 +1,6 @@
 """Hazards of bad numbers and names: a traceback, a message about something else, a silent zero."""
 
+import re
 import subprocess
 import sys
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from sidestep import evaluate, load_scenario, make_shield, train
-from sidestep.cli import main
+from sidestep._bounds import Bound, allowed
+from sidestep.cli import _RUN, main
 from sidestep.commands.evaluate import evaluation_table
 from sidestep.commands.train import training_table
+from sidestep.commands.video import Video
 from sidestep.learning import make_options
 from sidestep.loop import rollout
 from sidestep.pursuit import Pursuer
@@ -56,7 +59,44 @@ def test_seed_out_of_range_is_refused_by_the_environments(seed):
 @pytest.mark.parametrize("episodes", ["0", "-3"])
 def test_no_episodes_is_what_the_refusal_speaks_of(episodes, capsys):
     assert main(["evaluate", "--episodes", episodes]) == 2
-    assert f"episodes = {episodes}: it must be a whole number of at least 1" in capsys.readouterr().err
+    assert f"episodes = {episodes}: it must be a whole number from 1 to" in capsys.readouterr().err
+
+
+WORDS_OF = {
+    "train": "train --out t", "evaluate": "evaluate", "reproduce": "reproduce --out r", "certify": "certify",
+    "falsify": "falsify --out f", "play": "play", "report": "report run", "campaign": "campaign grid.toml",
+    "export": "export run --out e.onnx", "twin": "twin --out t", "fly": "fly --out f",
+}  # fmt: skip
+
+
+def numeric_options():
+    """Every numeric option of every command, with what none of them allows."""
+    for command in _RUN:
+        for owner in (command, *([Video] if "film" in allowed(command) else [])):
+            for name, rule in allowed(owner).items():
+                if isinstance(rule, Bound):
+                    many = rule.shape[0] or 1 if rule.shape else 1
+                    for value in ("-1", str(10**30)) if rule.whole else ("nan", "inf", "-1e300", "1e300"):
+                        yield pytest.param(
+                            command.__name__.lower(),
+                            name,
+                            [value] * many,
+                            id=f"{command.__name__}-{name}-{value}",
+                        )
+
+
+@pytest.mark.parametrize("command, name, value", [*numeric_options()])
+def test_number_that_cannot_be_is_refused_before_any_work(
+    command, name, value, tmp_path, monkeypatch, capsys
+):
+    """A traceback, a video of a million pictures after the episode, a search that never ends."""
+    monkeypatch.chdir(tmp_path)
+    words = value if len(value) > 1 else [f"--{name.replace('_', '-')}={value[0]}"]
+    option = [] if len(value) == 1 else [f"--{name.replace('_', '-')}"]
+    assert main([*WORDS_OF[command].split(), *option, *words]) == 2
+    told = capsys.readouterr().err
+    assert re.fullmatch(rf"sidestep: {name} = \S.*: it must be .*\d.*\n", told), told
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["evaluate", "play", "twin", "report", "export --out e.onnx"])

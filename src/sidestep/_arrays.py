@@ -13,6 +13,8 @@ from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Bool, Float, Int
 
+from sidestep._bounds import SEED, Bound, bounded, taken
+
 _FEW = 8
 
 AnyArray: TypeAlias = Array | np.ndarray
@@ -86,22 +88,16 @@ def traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def whole_number(name: str, value: Any, *, least: int = 1, most: int = 2**31 - 1) -> int:
+def whole_number(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
     """`value` as an int. **Raises** `ValueError` that calls it `name` if it is not a whole number from
-    `least` to `most`."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}")
-    if value > most:
-        raise ValueError(f"{name} = {value!r}: it must be at most {most}")
-    return int(value)
+    `least` to `most` (2^31 - 1 if not given)."""
+    return taken(name, value, Bound(least=least, most=most, whole=True))
 
 
 def seed_number(value: Any, name: str = "seed") -> int:
     """`value` as a seed. **Raises** `ValueError` that calls it `name` unless it is a whole number from 0 to
     2^32 - 1: of a larger one JAX would drop the upper bits, and two seeds would silently be one."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**32:
-        raise ValueError(f"{name} = {value!r}: it must be a whole number from 0 to 2^32 - 1, {2**32 - 1}")
-    return int(value)
+    return taken(name, value, SEED)
 
 
 def real(value: object) -> Float[Array, "..."]:
@@ -111,6 +107,12 @@ def real(value: object) -> Float[Array, "..."]:
     gain then never recompiles.
     """
     return jnp.asarray(value, dtype=float)
+
+
+def static_field(default: Any, rule: Any = None, **limits: Any) -> Any:
+    """A field of a module that is no array; `rule` and `limits` as for `bounded`."""
+    metadata = bounded(default, rule, **limits).metadata
+    return eqx.field(static=True, default=default, metadata=metadata)
 
 
 def length(x: Float[AnyArray, "*lanes"], y: Float[AnyArray, "*lanes"]) -> Lanes:

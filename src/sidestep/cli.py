@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from typing import Annotated, Any
 
 import tyro
 from tyro.conf import subcommand
 
+from sidestep._bounds import check
 from sidestep._compiled import keep_compiled_programs
 from sidestep.commands import (
     campaign,
@@ -62,6 +64,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     keep_compiled_programs()
     try:
+        for part in (command, *filter(is_dataclass, vars(command).values())):
+            check(part)
         with damage_on_stderr():
             return _RUN[type(command)](command, Console())
     except ValueError as error:

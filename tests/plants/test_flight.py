@@ -234,7 +234,7 @@ def test_the_certificate_counts_what_the_flight_cannot_know(scene):
         ({"wind": (1.0, math.nan)}, "wind"),
         ({"physics_step": 0.01}, "at most 0.002 s"),
         ({"autopilot_period": 0.0025}, "a multiple of physics_step"),
-        ({"pursuer_sees": "nothing"}, "truth, measurements"),
+        ({"pursuer_sees": "nothing"}, "'truth', 'measurements'"),
     ],
 )
 def test_options_that_cannot_be_are_named(options, words):

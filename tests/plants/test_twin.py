@@ -247,11 +247,11 @@ def test_omniwheels_turn_as_their_kinematics_say():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"base": "legs"}, "servo, omniwheels"),
+        ({"base": "legs"}, "'servo', 'omniwheels'"),
         ({"actuation_delay": -0.1}, "actuation_delay"),
         ({"acceleration": 0.0}, "acceleration"),
         ({"physics_step": 0.01}, "at most 0.002"),
-        ({"pursuer_sees": "nothing"}, "truth, measurements"),
+        ({"pursuer_sees": "nothing"}, "'truth', 'measurements'"),
     ],
 )
 def test_options_that_cannot_be_are_named(options, message):

@@ -335,7 +335,7 @@ def test_the_look_ahead_knows_the_motors_and_how_fast_the_robot_is():
 
 
 def test_settings_and_targets_that_cannot_be_are_refused_with_all_that_is_wrong():
-    with pytest.raises(ValueError, match=r"position_noise.*late_limit.*on_fault"):
+    with pytest.raises(ValueError, match=r"position_noise.*on_fault.*late_limit"):
         OnboardSettings(position_noise=-1.0, late_limit=0, on_fault="panic")
     with pytest.raises(ValueError, match="heading_error"):
         Onboard(SCENARIO, "game", settings=OnboardSettings(budget=Budget(heading_error=9.0)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import WORKERS, bounded
 from sidestep._program import command as command_line
 from sidestep.commands.common import CampaignBar, going_on, say, stood_still, write_json_file
 
@@ -32,9 +33,9 @@ class Campaign:
     """Folder for the results, a new one or this campaign's; by default runs/ and the file's name."""
     scheduler: Annotated[str, tyro.conf.arg(metavar="local|tcp://HOST:PORT")] = "local"
     """Workers on this machine, or those of a Dask scheduler that runs already."""
-    workers: int | None = None
+    workers: int | None = bounded(None, WORKERS)
     """Local workers, one job each at a time; one per core by default."""
-    threads_per_worker: int | None = None
+    threads_per_worker: int | None = bounded(None, WORKERS)
     """Cores for each local worker's job; an equal share of all by default."""
     dry_run: bool = False
     """Only check the file and say how many jobs it asks for."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sidestep._bounds import DELAY, DISTANCE, HEADING_ERROR, TRACKING_ERROR, bounded
 from sidestep.commands.certificate_words import print_certificate, print_known_robots, print_robots
 from sidestep.commands.common import Overrides, ScenarioName, scenario_overrides, write_json_file
 
@@ -34,21 +35,21 @@ class Certify:
     set: Overrides = ()
     """Scenario fields to change; pursuer_half_axle and control_period may be 0 here. wheel_separation, its
     double, may be given for pursuer_half_axle."""
-    position_error: float = 0.0
+    position_error: float = bounded(0.0, DISTANCE)
     """Largest error of a measured position of the pursuer, m."""
-    heading_error: float = 0.0
+    heading_error: float = bounded(0.0, HEADING_ERROR)
     """Largest error of a measured heading of the pursuer, rad."""
-    delay: float = 0.0
+    delay: float = bounded(0.0, DELAY)
     """Age of the measurements, s."""
     own_motion: bool = True
     """Whether the evader adds its own motion during the delay to what it measured."""
-    tracking_error: float = 0.0
+    tracking_error: float = bounded(0.0, TRACKING_ERROR)
     """How far the velocity that the evader drives may be from its command, m/s."""
     walls: bool = False
     """The robots are in a bounded arena."""
     start: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
     """A start to ask about: the evader in the pursuer's frame, m (x ahead, y left)."""
-    target_distance: float | None = None
+    target_distance: float | None = bounded(None, DISTANCE)
     """A target's distance from the evader to ask about, m: is it reached before capture?"""
     mine: tuple[Literal["evader", "sensing", "task", "pursuer"], ...] = ("evader", "sensing", "task")
     """What you can change: comes first among the changes that would help, and is tried in pairs. sensing: the

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import EPISODES, SEED, SIDE_BY_SIDE, bounded
 from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, stood_still, write_json_file
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
@@ -29,11 +30,11 @@ class Evaluate:
     """Shield: none, paper, game or joint; the run's own, or joint, by default."""
     pursuer: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Pursuer strategy; the run's own, or nash, by default."""
-    episodes: int = 1000
+    episodes: int = bounded(1000, EPISODES)
     """Episodes to measure."""
-    seed: int = 0
+    seed: int = bounded(0, SEED)
     """Seed of starts, targets and random pursuers."""
-    batch: int = 512
+    batch: int = bounded(512, SIDE_BY_SIDE)
     """Episodes that run at once."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""
@@ -41,7 +42,7 @@ class Evaluate:
     """Also write the figures to this file."""
     log: Path | None = None
     """Also write one episode as an MCAP log of ROS 2 messages; never over a file that exists."""
-    log_episode: int = 0
+    log_episode: int = bounded(0, least=0)
     """Which episode --log is to hold: the number of one of those measured."""
     video_episode: Annotated[str, tyro.conf.arg(metavar="NUMBER|worst")] = "0"
     """Which episode --video is to show: the number of one of those measured, or the one that came closest
@@ -51,17 +52,14 @@ class Evaluate:
 
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
-    from sidestep._arrays import seed_number, whole_number
     from sidestep.loop import episode_key, rollout
     from sidestep.store.outputs import try_outputs
     from sidestep.trials import evaluate as run_evaluation
 
     check_options(command.film)
     try_outputs(files=[command.json], new=[command.log, command.film.video])
-    whole_number("episodes", command.episodes), whole_number("batch", command.batch)
-    seed_number(command.seed)
     policy, scenario, config = policy_and_scenario(command.run, command.scenario, command.set)
-    if not 0 <= command.log_episode < command.episodes:
+    if command.log_episode >= command.episodes:
         raise ValueError(
             f"log_episode = {command.log_episode}: it must be the number of an episode, 0 to "
             f"{command.episodes - 1}"

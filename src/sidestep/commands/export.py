@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import DELAY, DISTANCE, HEADING_ERROR, TRACKING_ERROR, bounded
 from sidestep.commands.common import Overrides, scenario_of_run, write_json_file
 
 if TYPE_CHECKING:
@@ -33,13 +34,13 @@ class Export:
     """Preset or file; the run's own scenario, or paper, by default."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 capture_distance=0.15."""
-    position_error: float = 0.0
+    position_error: float = bounded(0.0, DISTANCE)
     """Budget: largest error of a measured relative position, m."""
-    heading_error: float = 0.0
+    heading_error: float = bounded(0.0, HEADING_ERROR)
     """Budget: largest error of a measured heading of a pursuer, rad."""
-    delay: float = 0.0
+    delay: float = bounded(0.0, DELAY)
     """Budget: time from a pose to the command decided on it, s; the own motion is taken to be predicted."""
-    tracking_error: float = 0.0
+    tracking_error: float = bounded(0.0, TRACKING_ERROR)
     """Budget: how far the velocity driven is from the velocity told, m/s."""
     overwrite: bool = False
     """Replace --out where it exists."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import DURATION, EPISODES, SEED, SIDE_BY_SIDE, bounded
 from sidestep._program import command as command_line
 from sidestep.commands.common import (
     CountBar,
@@ -50,18 +51,18 @@ class Falsify:
     """What counts: capture, collision or both."""
     attacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
     """Attacks: pursuers, bang-bang, herder, sideswipe, cross-entropy, edge, learned; all by default."""
-    minutes: float | None = None
+    minutes: float | None = bounded(None, DURATION)
     """Time to search for; 3 unless --episodes is given. With --resume on top of the time so far; what is left
     of it if neither is given."""
-    episodes: int | None = None
+    episodes: int | None = bounded(None, EPISODES)
     """Episodes after which each attack ends; with --resume the new total."""
-    seconds: float = unless_given(60.0)
+    seconds: float = bounded(unless_given(60.0), DURATION)
     """Longest episode, in seconds of its own time."""
-    batch: int = unless_given(256)
+    batch: int = bounded(unless_given(256), SIDE_BY_SIDE)
     """Episodes or plans tried at once; fewer make rounds shorter under a shield that is slow."""
-    most: int = unless_given(5)
+    most: int = bounded(unless_given(5), least=1)
     """Counterexamples to keep per attack and outcome (more if they go deeper, or break no assumption)."""
-    seed: int = unless_given(0)
+    seed: int = bounded(unless_given(0), SEED)
     """Seed of everything random."""
     resume: bool = False
     """Go on with the search in --out, with the settings it was begun with. Other options beside it must agree
@@ -75,7 +76,6 @@ class Falsify:
 
 def run(command: Falsify, console: Console) -> int:
     """Run `sidestep falsify`; returns the exit status."""
-    from sidestep._arrays import seed_number, whole_number
     from sidestep.store.outputs import try_outputs
 
     check_options(command.film)
@@ -85,8 +85,6 @@ def run(command: Falsify, console: Console) -> int:
     if command.replay is not None:
         out = command.out or command.replay.parent
     try_outputs(files=[command.json], new=[command.film.video], folders=[out])
-    seed_number(command.seed)
-    whole_number("batch", command.batch), whole_number("most", command.most)
     if command.replay is not None:
         return _replay(command, console)
     from sidestep.store.runs import writing

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from sidestep._bounds import DISTANCE, SPEED_UP, WIND, bounded
 from sidestep.commands.common import PursuerName, ScenarioName, parse_overrides
 from sidestep.commands.physics import PhysicsCommand, Plan, outcome_counts, run_on_plant
 
@@ -25,11 +26,11 @@ class Fly(PhysicsCommand):
     quadrotor makes a run for it."""
     pursuer: PursuerName = "chauffeur"
     """Pursuer strategy."""
-    speed: float = 1.0
+    speed: float = bounded(1.0, SPEED_UP)
     """How many times faster the video runs."""
-    tracking_error: float = 0.04
+    tracking_error: float = bounded(0.04, DISTANCE)
     """How far the quadrotor may be from the motion asked of it, m: the shield allows for it."""
-    wind: tuple[float, float] = (0.0, 0.0)
+    wind: tuple[float, float] = bounded((0.0, 0.0), WIND)
     """Wind along x and y, m/s."""
 
 

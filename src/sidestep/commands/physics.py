@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from sidestep import _interrupts
+from sidestep._bounds import EPISODES, SEED, SPEED_UP, bounded
 from sidestep.commands.common import (
     CountBar,
     Overrides,
@@ -46,21 +47,21 @@ class PhysicsCommand:
     """Fields of the sensors to change, such as position_noise=0.005 delay=0.05."""
     pursuer_sees: Literal["truth", "measurements"] = "truth"
     """What the pursuer decides from."""
-    seeds: int = 1
+    seeds: int = bounded(1, EPISODES)
     """Episodes, with the seeds from --seed on."""
-    seed: int = 0
+    seed: int = bounded(0, SEED)
     """First seed, of starts and measurements."""
-    steps: int | None = None
+    steps: int | None = bounded(None, least=1, whole=True)
     """At most this many control periods; the scenario's episode_steps by default."""
     out: Path | None = None
     """Folder for the figure of the first episode beside the plain simulation, and its recording."""
     video: Path | None = None
     """Also render the first episode into this .mp4, .gif or .webp file."""
-    speed: float = 2.0
+    speed: float = bounded(2.0, SPEED_UP)
     """How many times faster the video runs."""
-    rate: int = 25
+    rate: int = bounded(25, least=1, most=120)
     """Pictures per second of the video."""
-    width: int = 960
+    width: int = bounded(960, least=64, most=1920, unit="pixels")
     """Width of the video in pixels; 16 by 9."""
     json: Path | None = None
     """Also write the figures to this file."""
@@ -145,19 +146,11 @@ def run_on_plant(
 
 def check_amounts(command: PhysicsCommand) -> None:
     """**Raises** `ValueError` for a number of seeds, or an output, that there cannot be."""
-    from sidestep._arrays import seed_number, whole_number
+    from sidestep._arrays import whole_number
 
-    seed_number(command.seed)
     whole_number("seeds", command.seeds, most=2**32 - command.seed)
-    if command.steps is not None:
-        whole_number("steps", command.steps)
-    if not command.speed > 0.0:
-        raise ValueError(f"speed = {command.speed}: it must be greater than 0")
-    if command.rate < 1 or not 64 <= command.width <= 1920 or command.width % 2:
-        raise ValueError(
-            f"rate = {command.rate}, width = {command.width}: the rate must be at least 1, the width an even "
-            "number from 64 to 1920"
-        )
+    if command.width % 2:
+        raise ValueError(f"width = {command.width}: it must be an even number of pixels")
     if command.video is not None:
         from sidestep.views.video_files import check_video
 

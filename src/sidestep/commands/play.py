@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import SEED, VISITORS, bounded
 from sidestep.commands.common import Overrides, PursuerName, ShieldName, policy_and_scenario
 
 if TYPE_CHECKING:
@@ -30,15 +31,15 @@ class Play:
     """Pursuer at first: you, or a strategy such as nash."""
     set: Overrides = ()
     """Scenario fields to change, such as obstacle_count=2."""
-    seed: int = 0
+    seed: int = bounded(0, SEED)
     """Seed of the first visitor's starts and targets."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 lets everybody in who can reach this machine."""
-    port: int = 8765
+    port: int = bounded(8765, least=0, most=65535)
     """Port to listen on; 0 takes a free one."""
     allow_host: tuple[str, ...] = ()
     """Names under which others reach this machine, beside its addresses."""
-    visitors: int = 8
+    visitors: int = bounded(8, VISITORS)
     """Most visitors at once."""
     open: bool = False
     """Also open the page in the browser."""
@@ -46,10 +47,8 @@ class Play:
 
 def run(command: Play, console: Console) -> int:
     """Run `sidestep play` until Ctrl-C; returns the exit status."""
-    from sidestep._arrays import seed_number
     from sidestep.views.play import Hosting, Limits, serve
 
-    seed_number(command.seed)
     policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
     hosting = Hosting(
         scenario,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import bounded
 from sidestep.commands.common import CountBar
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
@@ -26,7 +27,7 @@ class Report:
     out: Path | None = None
     """HTML file to write; report.html in the first folder, or beside the episode, by default. Its figures go
     into figures/ beside it, or NAME-figures/ for NAME.html."""
-    episodes: int = 100
+    episodes: int = bounded(100, least=0, most=10**8)
     """Random episodes to run with a policy whose folder holds no record of any: for the histograms, the map
     of interventions and the worst episodes. They are kept in the folder. 0 for none."""
     film: VideoOptions = NO_VIDEO
@@ -46,8 +47,6 @@ def run(command: Report, console: Console) -> int:
         return _report_episode(command, console)
     if command.film.video is not None:
         raise ValueError("--video shows one episode: give its log or recording instead of a run")
-    if command.episodes < 0:
-        raise ValueError(f"episodes = {command.episodes}: it must be 0 or more")
     folders = _run_folders(command.runs, console)
     path = command.out or command.runs[0] / "report.html"
     _refuse_other_files(path)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import EPISODES, SEED, bounded
 from sidestep._program import command as command_of
 from sidestep.commands.common import (
     CountBar,
@@ -44,11 +45,11 @@ class Reproduce:
     """Shields to compare: none, paper, game and joint."""
     pursuer: PursuerName = unless_given("nash")
     """Pursuer strategy."""
-    episodes: int = unless_given(200)
+    episodes: int = bounded(unless_given(200), EPISODES)
     """Training episodes per shield (the paper's 200)."""
-    evaluation_episodes: int = unless_given(1000)
+    evaluation_episodes: int = bounded(unless_given(1000), EPISODES)
     """Random episodes to measure each trained policy on."""
-    seed: int = unless_given(0)
+    seed: int = bounded(unless_given(0), SEED)
     """Seed of everything random."""
     set: Overrides = ()
     """Scenario fields to change."""

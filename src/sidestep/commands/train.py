@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sidestep._bounds import EPISODES, SEED, bounded
 from sidestep._program import command as command_line
 from sidestep.commands.common import (
     Overrides,
@@ -41,9 +42,9 @@ class Train:
     pursuer: PursuerName = unless_given("nash")
     """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; for what
     cannot turn on the spot chauffeur."""
-    episodes: int = unless_given(200)
+    episodes: int = bounded(unless_given(200), EPISODES)
     """Episodes to train for; with --resume a larger number trains on to that total."""
-    seed: int = unless_given(0)
+    seed: int = bounded(unless_given(0), SEED)
     """Seed of everything random; the same seed gives the same run on the same machine."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""

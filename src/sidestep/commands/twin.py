@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from sidestep._bounds import ACCELERATION, DELAY, DISTANCE, bounded
 from sidestep.commands.common import parse_overrides
 from sidestep.commands.physics import PhysicsCommand, Plan, outcome_counts, run_on_plant
 
@@ -28,11 +29,11 @@ class Twin(PhysicsCommand):
     """Evader: planar joints with velocity servos, or three omniwheels with rollers."""
     sensors: Annotated[str, tyro.conf.arg(metavar="NAME")] = "motion-capture"
     """How poses are measured: perfect, motion-capture or odometry."""
-    actuation_delay: float = 0.0
+    actuation_delay: float = bounded(0.0, DELAY)
     """Seconds from a command to its effect."""
-    acceleration: float = 2.0
+    acceleration: float = bounded(2.0, ACCELERATION)
     """Limit of the evader's motors, m/s^2."""
-    position_error: float | None = None
+    position_error: float | None = bounded(None, DISTANCE)
     """Error of relative positions that the shield allows for, m; from the sensors by default."""
     log: Path | None = None
     """Also write the first episode as an MCAP log of ROS 2 messages; never over a file that exists."""

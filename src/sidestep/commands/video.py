@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sidestep._bounds import SPEED_UP, bounded
 from sidestep.commands.common import CountBar
 
 if TYPE_CHECKING:
@@ -20,13 +21,15 @@ class Video:
 
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also animate it into this .mp4, .gif or .webp file; never over a file that exists."""
-    video_speed: float = 1.0
+    video_speed: float = bounded(1.0, SPEED_UP)
     """How many times faster than it was."""
-    video_rate: int | None = None
+    video_rate: int | None = bounded(None, least=1, most=120, whole=True)
     """Pictures per second; 30, or 20 for .gif and .webp, by default."""
-    video_width: int | None = None
+    video_width: int | None = bounded(None, least=160, most=4096, whole=True, unit="pixels")
     """Pixels; 1280, or 720 for .gif and .webp, by default. The height is 9/16 of it."""
-    video_levels: Annotated[tuple[float, ...], tyro.conf.arg(metavar="[M ...]")] = (0.1, 0.2, 0.3)
+    video_levels: Annotated[tuple[float, ...], tyro.conf.arg(metavar="[M ...]")] = bounded(
+        (0.1, 0.2, 0.3), shape=(None,), empty=True, above=0.0, most=1e6, unit="m"
+    )
     """Levels of the barrier to draw beside level 0, in m; none make a .gif or .webp half as large."""
 
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import math
-from typing import Any, NoReturn
+from typing import Any
 
 import equinox as eqx
 import jax
-import numpy as np
 
-from sidestep._arrays import Scalar, real
+from sidestep._arrays import Scalar, real, static_field
+from sidestep._bounds import Bound, allowed, did_you_mean, one_of, taken, within
 from sidestep.learning.td3 import TD3
 
 
@@ -39,19 +37,19 @@ class TrainingOptions(eqx.Module):
     """
 
     algorithm: TD3 = eqx.field(default_factory=TD3)
-    exploration_noise: Scalar = eqx.field(converter=real, default=0.1)
-    hindsight: Scalar = eqx.field(converter=real, default=0.8)
-    reward_scale: Scalar = eqx.field(converter=real, default=0.01)
-    correction_penalty: Scalar = eqx.field(converter=real, default=0.0)
-    mirror: Scalar = eqx.field(converter=real, default=0.5)
+    exploration_noise: Scalar = eqx.field(converter=real, default=0.1, metadata=within(least=0.0))
+    hindsight: Scalar = eqx.field(converter=real, default=0.8, metadata=within(least=0.0, most=1.0))
+    reward_scale: Scalar = eqx.field(converter=real, default=0.01, metadata=within(least=0.0))
+    correction_penalty: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0))
+    mirror: Scalar = eqx.field(converter=real, default=0.5, metadata=within(least=0.0, most=1.0))
     bound_values: bool = eqx.field(static=True, default=True)
-    replay_action: str = eqx.field(static=True, default="proposed")
+    replay_action: str = static_field("proposed", one_of("proposed", "executed"))
     filter_gradients: bool = eqx.field(static=True, default=False)
-    decision_steps: int = eqx.field(static=True, default=10)
-    batch_size: int = eqx.field(static=True, default=256)
-    updates_per_decision: int = eqx.field(static=True, default=2)
-    warmup_decisions: int = eqx.field(static=True, default=256)
-    replay_capacity: int = eqx.field(static=True, default=1_000_000)
+    decision_steps: int = static_field(10, least=1)
+    batch_size: int = static_field(256, least=1)
+    updates_per_decision: int = static_field(2, least=1)
+    warmup_decisions: int = static_field(256, least=1)
+    replay_capacity: int = static_field(1_000_000, least=1)
 
     def __check_init__(self) -> None:
         if self.filter_gradients and self.replay_action != "executed":
@@ -61,20 +59,6 @@ class TrainingOptions(eqx.Module):
             )
 
 
-_FLOATS = {
-    "exploration_noise": (0.0, math.inf), "hindsight": (0.0, 1.0), "mirror": (0.0, 1.0),
-    "reward_scale": (0.0, math.inf), "correction_penalty": (0.0, math.inf),
-    "actor_learning_rate": (0.0, math.inf), "critic_learning_rate": (0.0, math.inf),
-    "discount": (0.0, 1.0), "target_rate": (0.0, 1.0), "target_noise": (0.0, math.inf),
-    "target_noise_clip": (0.0, math.inf), "last_layer_scale": (0.0, math.inf),
-}  # fmt: skip
-_WHOLE = {
-    "decision_steps": 1, "batch_size": 1, "updates_per_decision": 1, "warmup_decisions": 1,
-    "replay_capacity": 1, "policy_delay": 1,
-}  # fmt: skip
-_REPLAY_ACTIONS = ("proposed", "executed")
-
-
 def make_options(**values: Any) -> TrainingOptions:
     """Validated options from plain values, `TrainingOptions`' and `TD3`'s fields side by side.
 
@@ -82,59 +66,20 @@ def make_options(**values: Any) -> TrainingOptions:
 
     **Raises** `ValueError` naming the option, its value and what is allowed.
     """
-    algorithm_fields = [field.name for field in dataclasses.fields(TD3)]
-    loop_fields = [field.name for field in dataclasses.fields(TrainingOptions) if field.name != "algorithm"]
-    for name in values:
-        if name not in algorithm_fields + loop_fields:
-            near = difflib.get_close_matches(name, algorithm_fields + loop_fields, n=1)
-            raise ValueError(
-                f"unknown training option '{name}'" + (f"; did you mean '{near[0]}'?" if near else "")
-            )
-    values = {name: _checked(name, value) for name, value in values.items()}
-    algorithm = TD3(**{name: value for name, value in values.items() if name in algorithm_fields})
-    return TrainingOptions(
-        algorithm=algorithm, **{name: value for name, value in values.items() if name in loop_fields}
-    )
-
-
-def _checked(name: str, value: Any) -> Any:
-    """The value in the type its field needs."""
-
-    def fail(allowed: str) -> NoReturn:
-        raise ValueError(f"training option '{name}' = {value!r}: {allowed}")
-
-    if name in _FLOATS:
-        least, most = _FLOATS[name]
-        # Finite in the precision that will be used: 1e60 is infinite in float32.
-        with np.errstate(over="ignore"):
-            finite = _is_number(value) and bool(np.isfinite(np.asarray(value, dtype=real(0.0).dtype)))
-        if not finite or not least <= value <= most:
-            fail(
-                "it must be a finite number, " + (f"{least:g} or more" if most == math.inf else "from 0 to 1")
-            )
-        return float(value)
-    if name in _WHOLE:
-        if not _is_number(value) or not math.isfinite(value) or value != int(value) or value < _WHOLE[name]:
-            fail(f"it must be a whole number of at least {_WHOLE[name]}")
-        return int(value)
-    if name in ("bound_values", "filter_gradients"):
-        if not isinstance(value, bool):
-            fail("it must be true or false")
-    elif name == "replay_action":
-        if value not in _REPLAY_ACTIONS:
-            fail(f"it must be one of {', '.join(map(repr, _REPLAY_ACTIONS))}")
-    elif name == "hidden":
-        widths = value if isinstance(value, (list, tuple)) else ()
-        if not widths or not all(
-            _is_number(n) and isinstance(n, (int, np.integer)) and n > 0 for n in widths
-        ):
-            fail("it must be layer widths, such as [256, 256]")
-        return tuple(int(n) for n in widths)
-    return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    rules: dict[str, Any] = {**allowed(TD3), **allowed(TrainingOptions)}
+    del rules["algorithm"]
+    used = {}
+    for name, value in values.items():
+        if name not in rules:
+            raise ValueError(f"unknown training option '{name}'{did_you_mean(name, rules)}")
+        rule = rules[name]
+        # JSON from elsewhere writes 10 as 10.0.
+        whole = isinstance(rule, Bound) and rule.whole and isinstance(value, float) and value.is_integer()
+        used[name] = taken(f"training option '{name}'", int(value) if whole else value, rule)
+    if "hidden" in used:
+        used["hidden"] = tuple(used["hidden"].tolist())
+    algorithm = TD3(**{name: used.pop(name) for name in allowed(TD3) if name in used})
+    return TrainingOptions(algorithm=algorithm, **used)
 
 
 def options_to_dict(options: TrainingOptions) -> dict[str, Any]:

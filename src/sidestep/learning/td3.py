@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Scalar, real
+from sidestep._arrays import Scalar, real, static_field
+from sidestep._bounds import within
 from sidestep.learning.networks import Actor, TwinCritic
 
 Bound = Callable[[Float[Array, "batch action"], PRNGKeyArray], Float[Array, "batch action"]]
@@ -30,15 +31,15 @@ class TD3(eqx.Module):
     reference starts it at 1); everything else is the reference's.
     """
 
-    actor_learning_rate: Scalar = eqx.field(converter=real, default=3e-4)
-    critic_learning_rate: Scalar = eqx.field(converter=real, default=3e-4)
-    discount: Scalar = eqx.field(converter=real, default=0.99)
-    target_rate: Scalar = eqx.field(converter=real, default=0.005)
-    target_noise: Scalar = eqx.field(converter=real, default=0.2)
-    target_noise_clip: Scalar = eqx.field(converter=real, default=0.5)
-    policy_delay: int = eqx.field(static=True, default=2)
-    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
-    last_layer_scale: float = eqx.field(static=True, default=0.01)
+    actor_learning_rate: Scalar = eqx.field(converter=real, default=3e-4, metadata=within(least=0.0))
+    critic_learning_rate: Scalar = eqx.field(converter=real, default=3e-4, metadata=within(least=0.0))
+    discount: Scalar = eqx.field(converter=real, default=0.99, metadata=within(least=0.0, most=1.0))
+    target_rate: Scalar = eqx.field(converter=real, default=0.005, metadata=within(least=0.0, most=1.0))
+    target_noise: Scalar = eqx.field(converter=real, default=0.2, metadata=within(least=0.0))
+    target_noise_clip: Scalar = eqx.field(converter=real, default=0.5, metadata=within(least=0.0))
+    policy_delay: int = static_field(2, least=1)
+    hidden: tuple[int, ...] = static_field((256, 256), whole=True, shape=(None,), least=1)
+    last_layer_scale: float = static_field(0.01, least=0.0)
 
     def init(self, observations: int, actions: int, key: PRNGKeyArray) -> Learner:
         """Fresh networks; targets start equal to them."""

@@ -14,8 +14,10 @@ from jaxtyping import Array, PRNGKeyArray
 
 from sidestep import _interrupts
 from sidestep._arrays import seed_number, whole_number
+from sidestep._bounds import taken
 from sidestep.loop.keys import start_and_pursuit
-from sidestep.plants.options import check_pursuer_sees
+from sidestep.plants.library import TwinError
+from sidestep.plants.options import SEEN
 from sidestep.plants.plant import Plant
 from sidestep.plants.record import Log, PlantEpisode
 from sidestep.pursuit import Pursuer, as_pursuer, pursue
@@ -93,7 +95,7 @@ def play(
     **Raises** `ValueError` as `evaluate`, and as the plant.
     """
     scenario = plant.scenario
-    check_pursuer_sees(pursuer_sees)
+    taken("pursuer_sees", pursuer_sees, SEEN, TwinError)
     limit = scenario.episode_steps if steps is None else whole_number("steps", steps)
     strategy = as_pursuer(pursuer)
     drawn, key = start_of(scenario, jnp.asarray(seed_number(seed), jnp.uint32))

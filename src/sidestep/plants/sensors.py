@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections import deque
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._bounds import DISTANCE, bounded, check, did_you_mean
 from sidestep.plants.library import TwinError
 
 _CUT = 3.0
@@ -31,25 +31,19 @@ class Sensors:
     - `delay` s from the sample to its arrival; `dropout` the share of samples that never arrive
     """
 
-    rate: float = 100.0
-    position_noise: float = 0.0
-    heading_noise: float = 0.0
-    position_bias: float = 0.0
-    heading_bias: float = 0.0
-    position_drift: float = 0.0
-    heading_drift: float = 0.0
-    delay: float = 0.0
-    dropout: float = 0.0
+    rate: float = bounded(100.0, least=0.1, most=1e4, unit="Hz")
+    position_noise: float = bounded(0.0, DISTANCE)
+    heading_noise: float = bounded(0.0, least=0.0, unit="rad")
+    position_bias: float = bounded(0.0, DISTANCE)
+    heading_bias: float = bounded(0.0, least=0.0, unit="rad")
+    position_drift: float = bounded(0.0, least=0.0, unit="m/sqrt(s)")
+    heading_drift: float = bounded(0.0, least=0.0, unit="rad/sqrt(s)")
+    delay: float = bounded(0.0, least=0.0, most=60.0, unit="s")
+    dropout: float = bounded(0.0, least=0.0, below=1.0)
     synchronised: bool = False
 
     def __post_init__(self):
-        for name, value in self.numbers().items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise TwinError(f"sensors: {name} = {value!r}: it must be a finite number, 0 or more")
-        if self.rate <= 0.0:
-            raise TwinError(f"sensors: rate = {self.rate!r}: it must be greater than 0")
-        if self.dropout >= 1.0:
-            raise TwinError(f"sensors: dropout = {self.dropout!r}: it must be less than 1")
+        check(self, title="sensors: ", error=TwinError)
 
     def numbers(self) -> dict[str, float]:
         """Every figure by name."""
@@ -97,19 +91,15 @@ def make_sensors(name: str, overrides: Mapping[str, Any] | None = None) -> Senso
 def changed_sensors(sensors: Sensors, changes: Mapping[str, Any]) -> Sensors:
     """`sensors` with some fields changed. **Raises** `TwinError` naming the known fields."""
     known = [field.name for field in dataclasses.fields(Sensors)]
-    for field, value in changes.items():
+    for field in changes:
         if field not in known:
-            near = difflib.get_close_matches(field, known, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
+            hint = did_you_mean(field, known)
             raise TwinError(f"unknown field '{field}' of the sensors{hint} Known: {', '.join(known)}")
-        wanted = bool if field == "synchronised" else (int, float)
-        if not isinstance(value, wanted) or (field != "synchronised" and isinstance(value, bool)):
-            raise TwinError(f"sensors: {field} = {value!r}: it must be {_KINDS[field == 'synchronised']}")
+    check(Sensors, changes, title="sensors: ", error=TwinError)
     return dataclasses.replace(sensors, **changes)
 
 
 _SEEN_BEFORE = 0.5
-_KINDS = {True: "true or false", False: "a number"}
 
 
 class Measurement(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from sidestep._bounds import bounded, check, one_of
 from sidestep.safety import Budget
 
 ON_FAULT = ("evade", "stop")
@@ -35,43 +36,25 @@ class OnboardSettings:
     """
 
     budget: Budget = field(default_factory=Budget)
-    position_noise: float = 0.001
-    heading_noise: float = 0.005
-    actuation_delay: float = 0.0
-    motor_lag: float = 0.0
-    motor_acceleration: float = math.inf
+    position_noise: float = bounded(0.001, least=0.0, unit="m")
+    heading_noise: float = bounded(0.005, least=0.0, unit="rad")
+    actuation_delay: float = bounded(0.0, least=0.0, unit="s")
+    motor_lag: float = bounded(0.0, least=0.0, unit="s")
+    motor_acceleration: float = bounded(math.inf, above=0.0, infinite=True, unit="m/s^2")
     predict_pursuer: bool = False
-    obstacle_acceleration: float = 0.005
-    stale_after: float = 0.2
-    nominal_timeout: float = 0.5
-    on_fault: str = "evade"
-    jump_tolerance: float = 0.05
-    heading_tolerance: float = 0.35
-    jump_confirmations: int = 5
-    future_tolerance: float = 0.05
-    late_after: float = 1.5
-    late_limit: int = 3
+    obstacle_acceleration: float = bounded(0.005, least=0.0, unit="m/s per root second")
+    stale_after: float = bounded(0.2, least=0.0, unit="s")
+    nominal_timeout: float = bounded(0.5, least=0.0, unit="s")
+    on_fault: str = bounded("evade", one_of(*ON_FAULT))
+    jump_tolerance: float = bounded(0.05, least=0.0, unit="m")
+    heading_tolerance: float = bounded(0.35, least=0.0, unit="rad")
+    jump_confirmations: int = bounded(5, least=1)
+    future_tolerance: float = bounded(0.05, least=0.0, unit="s")
+    late_after: float = bounded(1.5, least=1.0, unit="periods")
+    late_limit: int = bounded(3, least=1)
 
     def __post_init__(self) -> None:
-        wrong = [
-            f"{name} = {getattr(self, name)!r}: it must be a finite number, 0 or more"
-            for name in (
-                "position_noise", "heading_noise", "actuation_delay", "motor_lag", "obstacle_acceleration",
-                "stale_after", "nominal_timeout", "jump_tolerance", "heading_tolerance", "future_tolerance",
-            )
-            if not _is_number(getattr(self, name), 0.0)
-        ]  # fmt: skip
-        if not self.motor_acceleration > 0.0:
-            wrong.append(f"motor_acceleration = {self.motor_acceleration!r}: it must be more than 0 m/s^2")
-        if not _is_number(self.late_after, 1.0):
-            wrong.append(f"late_after = {self.late_after!r}: it must be at least 1 period")
-        for name in ("jump_confirmations", "late_limit"):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 1):
-                wrong.append(f"{name} = {getattr(self, name)!r}: it must be a whole number, 1 or more")
-        if self.on_fault not in ON_FAULT:
-            wrong.append(f"on_fault = {self.on_fault!r}: use one of {', '.join(map(repr, ON_FAULT))}")
-        if wrong:
-            raise ValueError("onboard settings: " + "; ".join(wrong))
+        check(self, title="onboard settings: ")
 
     def forgotten_after(self, period: float) -> float:
         """For how long (s) motions, sides and plans may go without a pose or a decision before they say
@@ -82,7 +65,3 @@ class OnboardSettings:
     def response(self) -> float:
         """From a decision to when its command acts, s."""
         return self.actuation_delay + self.motor_lag
-
-
-def _is_number(value: object, least: float) -> bool:
-    return isinstance(value, (int, float)) and math.isfinite(value) and value >= least

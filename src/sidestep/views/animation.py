@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from sidestep._bounds import SPEED_UP, Bound, taken
 from sidestep.loop import Trajectory
 from sidestep.views.stage import LEVELS, Stage
-from sidestep.views.video_files import VideoError, check_video, write_video_file
+from sidestep.views.video_files import HOLD, VideoError, check_video, write_video_file
 from sidestep.world import Scenario
 
 _NARROWEST, _WIDEST_PIXELS = 160, 4096
@@ -81,15 +82,14 @@ def check_numbers(
     levels: Sequence[float] = LEVELS,
 ) -> None:
     """**Raises** `VideoError` when `animate` could not take these arguments for this file."""
-    if not (np.isfinite(speed) and speed > 0.0):
-        raise VideoError(f"speed = {speed}: it must be greater than 0")
     # Browsers slow down a GIF that is faster.
     most = 50 if path.suffix.lower() == ".gif" else 120
-    if rate is not None and not 1 <= rate <= most:
-        raise VideoError(f"rate = {rate}: it must be 1 to {most} pictures per second")
-    if width is not None and not _NARROWEST <= width <= _WIDEST_PIXELS:
-        raise VideoError(f"width = {width}: it must be {_NARROWEST} to {_WIDEST_PIXELS} pixels")
-    if not (np.isfinite(hold) and hold >= 0.0):
-        raise VideoError(f"hold = {hold}: it must be 0 s or more")
-    if not all(np.isfinite(level) and level > 0.0 for level in levels):
-        raise VideoError(f"levels = {tuple(levels)}: each must be greater than 0 m")
+    for name, value, bound in (
+        ("speed", speed, SPEED_UP),
+        ("rate", rate, Bound(least=1, most=most, whole=True, unit="pictures per second")),
+        ("width", width, Bound(least=_NARROWEST, most=_WIDEST_PIXELS, whole=True, unit="pixels")),
+        ("hold", hold, HOLD),
+        ("levels", tuple(levels), Bound(shape=(None,), empty=True, above=0.0, most=1e6, unit="m")),
+    ):
+        if value is not None:
+            taken(name, value, bound, VideoError)

@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import UInt8
 
+from sidestep._bounds import Bound, taken
 from sidestep._packages import install_extra, needed
 from sidestep.store.files import OutputError, whole_file
 from sidestep.store.outputs import try_outputs
@@ -18,6 +19,7 @@ from sidestep.store.outputs import try_outputs
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
 
 SUFFIXES = (".mp4", ".gif", ".webp")
+HOLD = Bound(least=0.0, most=1e6, unit="s")
 _H264 = {"crf": "21", "preset": "veryfast", "tune": "animation"}
 """Quality 21: 18 is hardly to be told from the original, 28 looks worn. Slower presets gain nothing here."""
 _COLOURS = 127
@@ -91,10 +93,8 @@ def write_video_file(
     happens, no part of a file is left.
     """
     path = check_video(path)
-    if rate < 1 or hold < 0.0:
-        raise VideoError(
-            f"rate = {rate}, hold = {hold}: a rate of at least 1 and no negative hold are needed"
-        )
+    taken("rate", rate, Bound(least=1, whole=True), VideoError)
+    taken("hold", hold, HOLD, VideoError)
     stream = iter(pictures)
     first = next(stream, None)
     if first is None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
+
+from sidestep._bounds import Bound, did_you_mean, taken
 
 
 class ScenarioError(ValueError):
@@ -116,14 +116,11 @@ def without_aliases(values: Mapping[str, Any], *, zero: bool = False) -> dict[st
                 f"'{alias}' = {value!r} and '{field}' = {plain[field]!r} are both given, and both say the "
                 f"same ('{field}' is {factor:g} times '{alias}'): give one of them"
             )
+        bound = Bound(least=0.0) if zero else Bound(above=0.0)
         try:
-            number = math.nan if isinstance(value, (bool, str)) else float(value)
-        except (TypeError, ValueError):
-            number = math.nan
-        if not (math.isfinite(number) and (number > 0.0 or (zero and number == 0.0))):
-            bound = "0 or more" if zero else "greater than 0"
-            raise ScenarioError(f"scenario field '{alias}' = {value!r}: it must be finite and {bound}")
-        plain[field] = factor * number
+            plain[field] = factor * taken(f"scenario field '{alias}'", value, bound)
+        except ValueError as error:
+            raise ScenarioError(str(error)) from None
     return plain
 
 
@@ -131,6 +128,5 @@ def unknown_field(name: str, known: Iterable[str]) -> str:
     """What to say of a name that is neither a field nor an alias."""
     names = sorted([*known, *ALIASES])
     meant = _ADVICE.get(name.lower().replace("-", "_"))
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f": {meant}." if meant else f"; did you mean '{near[0]}'?" if near else "."
+    hint = f": {meant}." if meant else did_you_mean(name, names)
     return f"unknown scenario field '{name}'{hint} Known fields: {', '.join(names)}."

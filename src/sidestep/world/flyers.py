@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arrays import Scalar, real
+from sidestep._bounds import bounded, check
 from sidestep.world.models import EvaderModel, EvaderState, PursuerModel
 from sidestep.world.scenario import Scenario
 
@@ -33,17 +34,18 @@ class Quadrotor(EvaderModel):
     **Raises** `ValueError` for time constants that are not above 0, or tau <= 4 T.
     """
 
-    time_constant: float = 0.22
+    time_constant: float = bounded(0.22, above=0.0, unit="s")
     """tau, s."""
-    attitude_lag: float = 0.05
+    attitude_lag: float = bounded(0.05, above=0.0, unit="s")
     """T, s."""
 
     def __check_init__(self):
+        check(self)
         tau, lag = float(self.time_constant), float(self.attitude_lag)
-        if not (tau > 0.0 and lag > 0.0 and tau > 4.0 * lag):
+        if tau <= 4.0 * lag:
             raise ValueError(
-                f"time_constant = {tau:g} s, attitude_lag = {lag:g} s: both must be above 0, and the time "
-                "constant more than four times the lag, or the velocity overshoots"
+                f"time_constant = {tau:g} s, attitude_lag = {lag:g} s: the time constant must be more than "
+                "four times the lag, or the velocity overshoots"
             )
 
     def _rates(self) -> tuple[Scalar, Scalar]:
@@ -100,16 +102,13 @@ class Aircraft(PursuerModel):
     **Raises** `ValueError` for a radius that is not above 0, or a share outside [0, 1].
     """
 
-    turning_radius: float = 4.0
+    turning_radius: float = bounded(4.0, above=0.0, unit="m")
     """R, m."""
-    slowest: float = 0.5
+    slowest: float = bounded(0.5, least=0.0, most=1.0)
     """Least speed, as a share of V."""
 
     def __check_init__(self):
-        if not float(self.turning_radius) > 0.0:
-            raise ValueError(f"turning_radius = {self.turning_radius!r}: it must be above 0 m")
-        if not 0.0 <= float(self.slowest) <= 1.0:
-            raise ValueError(f"slowest = {self.slowest!r}: it must be a share from 0 to 1")
+        check(self)
 
     def limit(self, scenario: Scenario, speed: Scalar, turn_rate: Scalar) -> tuple[Scalar, Scalar]:
         top = scenario.pursuer_speed

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep._arrays import real
+from sidestep._bounds import check
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
 from sidestep.world.field_names import ScenarioError, unknown_field, without_aliases
 from sidestep.world.flyers import Aircraft, Quadrotor
@@ -64,93 +63,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-_POSITIVE = {
-    "evader_speed", "pursuer_speed", "pursuer_half_axle", "capture_distance", "collision_distance",
-    "reach_distance", "control_period", "arena_side",
-}  # fmt: skip
-_NOT_NEGATIVE = {
-    "pursuer_gain", "obstacle_gain", "reach_reward", "distance_cost",
-    "initial_separation", "obstacle_separation", "target_separation",
-}  # fmt: skip
-_COUNTS = {"pursuer_count": 1, "obstacle_count": 0, "episode_steps": 1}
 _STARTS = {"pursuer_starts": "pursuer_count", "obstacle_starts": "obstacle_count"}
-_CHOICES = {
-    "action": ("velocity", "heading"),
-    "obstacle_directions": ("fixed", "random"),
-    "frame": ("target", "world"),
-}
 _MODELS = {"evader_model": EvaderModel, "pursuer_model": PursuerModel}
 _NAMED: dict[str, type[EvaderModel] | type[PursuerModel]] = {"quadrotor": Quadrotor, "aircraft": Aircraft}
 """Models that a file can name."""
-_SHAPES: dict[str, tuple[int | None, ...]] = {
-    "obstacle_velocity": (2,),
-    "evader_start": (2,),
-    "target_start": (2,),
-    "pursuer_starts": (None, 3),
-    "obstacle_starts": (None, 2),
-}
 
 
 def _fail(field: str, value: object, allowed: str) -> None:
     raise ScenarioError(f"scenario field '{field}' = {value!r}: {allowed}")
-
-
-def _check_fields(values: Mapping[str, Any]) -> None:
-    known = [field.name for field in fields(Scenario)]
-    for name in values:
-        if name not in known:
-            raise ScenarioError(unknown_field(name, known))
-
-
-def _check_number(name: str, value: Any, test: Callable[[float], bool], allowed: str) -> None:
-    try:
-        # In the precision that will be used: 1e-60 is 0 in float32, 1e60 infinite.
-        with np.errstate(over="ignore"):
-            number = float(np.asarray(float(value), dtype=real(0.0).dtype))
-    except (TypeError, ValueError):
-        return _fail(name, value, f"a number is needed, {allowed}")
-    if isinstance(value, bool) or not math.isfinite(number) or not test(number):
-        _fail(name, value, f"it must be finite and {allowed}")
-
-
-def _check_values(values: Mapping[str, Any]) -> None:
-    for name, value in values.items():
-        if name in _POSITIVE:
-            _check_number(name, value, lambda number: number > 0.0, "greater than 0")
-        elif name in _NOT_NEGATIVE:
-            _check_number(name, value, lambda number: number >= 0.0, "0 or more")
-        elif name in _COUNTS:
-            least = _COUNTS[name]
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                _fail(name, value, f"it must be a whole number of at least {least}")
-        elif name in _CHOICES:
-            if value not in _CHOICES[name]:
-                _fail(name, value, f"it must be one of {', '.join(map(repr, _CHOICES[name]))}")
-        elif name in _SHAPES and value is not None:
-            shape = _SHAPES[name]
-            try:
-                array = np.asarray(value, dtype=float)
-            except (TypeError, ValueError):
-                array = np.asarray(np.nan)
-            if name == "obstacle_starts" and array.size == 0:
-                array = array.reshape(0, 2)
-            fits = array.ndim == len(shape) and all(
-                n in (None, m) for n, m in zip(shape, array.shape, strict=True)
-            )
-            if not fits or not np.all(np.isfinite(array)):
-                wanted = " x ".join("n" if n is None else str(n) for n in shape)
-                _fail(name, value, f"it must be {wanted} finite numbers")
-        elif name in _MODELS:
-            if not isinstance(value, (_MODELS[name], type(None))):
-                _fail(
-                    name,
-                    value,
-                    f"it must be a {_MODELS[name].__name__}, or None for the built-in robot, or by name "
-                    f"({', '.join(_names_of(name))}). One of your own is code: give it to load_scenario "
-                    "beside the file",
-                )
-        elif name == "name" and not isinstance(value, str):
-            _fail(name, value, "it must be text")
 
 
 def _check_scene(scenario: Scenario) -> None:
@@ -197,33 +117,42 @@ def _names_of(field: str) -> list[str]:
 
 
 def _model(field: str, value: Any) -> Any:
-    """The model that a file names: `"quadrotor"`, or `{model = "quadrotor", time_constant = 0.3}`."""
+    """A model, None, or what a file names: `"quadrotor"`, or `{model = "quadrotor", time_constant = 0.3}`."""
     told = {"model": value} if isinstance(value, str) else value
     if not isinstance(told, Mapping) or told.get("model") not in _names_of(field):
+        if not isinstance(value, (_MODELS[field], type(None))):
+            _fail(
+                field,
+                value,
+                f"it must be a {_MODELS[field].__name__}, or None for the built-in robot, or by name "
+                f"({', '.join(_names_of(field))}). One of your own is code: give it to load_scenario "
+                "beside the file",
+            )
         return value
-    numbers = {name: number for name, number in told.items() if name != "model"}
     kind = _NAMED[told["model"]]
-    for name, number in numbers.items():
-        known = [one.name for one in fields(kind)]
+    numbers, known = (
+        {name: told[name] for name in told if name != "model"},
+        [one.name for one in fields(kind)],
+    )
+    for name in numbers:
         if name not in known:
             _fail(field, value, f"a {told['model']} has no '{name}'; it has {', '.join(known)}")
-        if isinstance(number, bool) or not isinstance(number, (int, float)):
-            _fail(field, value, f"'{name}' must be a number")
     try:
-        return kind(**numbers)
+        return kind(**check(kind, numbers))
     except ValueError as error:
         raise ScenarioError(f"scenario field '{field}' = {value!r}: {error}") from None
 
 
 def _build(values: dict[str, Any]) -> Scenario:
-    _check_fields(values)
+    known = [field.name for field in fields(Scenario)]
+    for name in values:
+        if name not in known:
+            raise ScenarioError(unknown_field(name, known))
     values = {name: _model(name, value) if name in _MODELS else value for name, value in values.items()}
-    _check_values(values)
-    for name in _SHAPES:
-        if values.get(name) is not None:
-            array = np.asarray(values[name], dtype=float)
-            # Only `obstacle_starts` may be empty.
-            values[name] = jnp.asarray(array if array.size else array.reshape(0, 2), dtype=float)
+    values = check(Scenario, values, label="scenario field '{}'", error=ScenarioError)
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            values[name] = jnp.asarray(value, dtype=float)
     for starts, count in _STARTS.items():
         if values.get(starts) is None:
             continue
@@ -232,9 +161,6 @@ def _build(values: dict[str, Any]) -> Scenario:
         if wanted > given:
             _fail(count, wanted, f"only {given} fixed starts are given in '{starts}'; give {wanted}, or none")
         values[starts] = values[starts][:wanted]
-    for count in _COUNTS:
-        if count in values:
-            values[count] = int(values[count])
     scenario = Scenario(**values)
     wrong = check_models(scenario)
     if wrong:

@@ -19,7 +19,9 @@ from sidestep._arrays import (
     norm,
     real,
     stack,
+    static_field,
 )
+from sidestep._bounds import bounded, one_of, within
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame, usable_angle
 from sidestep.world.events import Events
 from sidestep.world.models import EvaderModel, EvaderState, PursuerModel, evader_of
@@ -69,35 +71,37 @@ class Scenario(eqx.Module):
     the omnidirectional evader and the differential drive. They are code: a file cannot hold them.
     """
 
-    evader_speed: Scalar = eqx.field(converter=real, default=0.1574)
-    pursuer_speed: Scalar = eqx.field(converter=real, default=0.2)
-    pursuer_half_axle: Scalar = eqx.field(converter=real, default=0.2)
-    capture_distance: Scalar = eqx.field(converter=real, default=0.2)
-    collision_distance: Scalar = eqx.field(converter=real, default=0.2)
-    reach_distance: Scalar = eqx.field(converter=real, default=0.05)
-    obstacle_velocity: Float[Array, "2"] = eqx.field(converter=real, default=(0.02, 0.0))
-    control_period: Scalar = eqx.field(converter=real, default=0.05)
-    pursuer_gain: Scalar = eqx.field(converter=real, default=1.2)
-    obstacle_gain: Scalar = eqx.field(converter=real, default=1.0)
-    reach_reward: Scalar = eqx.field(converter=real, default=1000.0)
-    distance_cost: Scalar = eqx.field(converter=real, default=0.01)
-    arena_side: Scalar = eqx.field(converter=real, default=3.0)
-    initial_separation: Scalar = eqx.field(converter=real, default=0.6)
-    obstacle_separation: Scalar = eqx.field(converter=real, default=0.3)
-    target_separation: Scalar = eqx.field(converter=real, default=0.5)
-    evader_start: Float[Array, "2"] | None = None
-    pursuer_starts: Float[Array, "m 3"] | None = None
-    obstacle_starts: Float[Array, "k 2"] | None = None
-    target_start: Float[Array, "2"] | None = None
+    evader_speed: Scalar = eqx.field(converter=real, default=0.1574, metadata=within(above=0.0, unit="m/s"))
+    pursuer_speed: Scalar = eqx.field(converter=real, default=0.2, metadata=within(above=0.0, unit="m/s"))
+    pursuer_half_axle: Scalar = eqx.field(converter=real, default=0.2, metadata=within(above=0.0, unit="m"))
+    capture_distance: Scalar = eqx.field(converter=real, default=0.2, metadata=within(above=0.0, unit="m"))
+    collision_distance: Scalar = eqx.field(converter=real, default=0.2, metadata=within(above=0.0, unit="m"))
+    reach_distance: Scalar = eqx.field(converter=real, default=0.05, metadata=within(above=0.0, unit="m"))
+    obstacle_velocity: Float[Array, "2"] = eqx.field(
+        converter=real, default=(0.02, 0.0), metadata=within(shape=(2,), unit="m/s")
+    )
+    control_period: Scalar = eqx.field(converter=real, default=0.05, metadata=within(above=0.0, unit="s"))
+    pursuer_gain: Scalar = eqx.field(converter=real, default=1.2, metadata=within(least=0.0, unit="1/s"))
+    obstacle_gain: Scalar = eqx.field(converter=real, default=1.0, metadata=within(least=0.0, unit="1/s"))
+    reach_reward: Scalar = eqx.field(converter=real, default=1000.0, metadata=within(least=0.0))
+    distance_cost: Scalar = eqx.field(converter=real, default=0.01, metadata=within(least=0.0))
+    arena_side: Scalar = eqx.field(converter=real, default=3.0, metadata=within(above=0.0, unit="m"))
+    initial_separation: Scalar = eqx.field(converter=real, default=0.6, metadata=within(least=0.0, unit="m"))
+    obstacle_separation: Scalar = eqx.field(converter=real, default=0.3, metadata=within(least=0.0, unit="m"))
+    target_separation: Scalar = eqx.field(converter=real, default=0.5, metadata=within(least=0.0, unit="m"))
+    evader_start: Float[Array, "2"] | None = bounded(None, shape=(2,))
+    pursuer_starts: Float[Array, "m 3"] | None = bounded(None, shape=(None, 3))
+    obstacle_starts: Float[Array, "k 2"] | None = bounded(None, shape=(None, 2), empty=True)
+    target_start: Float[Array, "2"] | None = bounded(None, shape=(2,))
     evader_model: EvaderModel | None = None
     pursuer_model: PursuerModel | None = None
     name: str = eqx.field(static=True, default="paper")
-    pursuer_count: int = eqx.field(static=True, default=1)
-    obstacle_count: int = eqx.field(static=True, default=1)
-    episode_steps: int = eqx.field(static=True, default=5000)
-    action: str = eqx.field(static=True, default="velocity")
-    obstacle_directions: str = eqx.field(static=True, default="fixed")
-    frame: str = eqx.field(static=True, default="target")
+    pursuer_count: int = static_field(1, least=1)
+    obstacle_count: int = static_field(1, least=0)
+    episode_steps: int = static_field(5000, least=1)
+    action: str = static_field("velocity", one_of("velocity", "heading"))
+    obstacle_directions: str = static_field("fixed", one_of("fixed", "random"))
+    frame: str = static_field("target", one_of("target", "world"))
 
     @property
     def usable_angle(self) -> Scalar:

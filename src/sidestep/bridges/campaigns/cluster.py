@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from sidestep._bounds import WORKERS, taken
 from sidestep._compiled import cores
 from sidestep._packages import needed
 
@@ -25,11 +26,11 @@ _LOCAL_CONFIG = {"distributed.scheduler.http.routes": [], "distributed.worker.ht
 def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:
     """Workers, and threads for each: together as many as there are cores, unless told otherwise.
 
-    **Raises** `ValueError` for a number below 1.
+    **Raises** `ValueError` for a number that is not from 1 to 1024.
     """
     for name, value in (("workers", workers), ("threads_per_worker", threads)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} = {value}: at least 1 is needed")
+        if value is not None:
+            taken(name, value, WORKERS)
     if workers is None:
         return max(1, cores() // (threads or 1)), threads or 1
     return workers, threads or max(1, cores() // workers)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sidestep._bounds import bounded, check
 from sidestep.plants.drawing import mjcf_colour, studio
 from sidestep.world.flyers import GRAVITY
 
@@ -29,20 +30,16 @@ class Airframe:
     - `drag` N s/m, what the rotors' blades oppose to motion
     """
 
-    mass: float = 0.028
-    inertia: tuple[float, float, float] = (16.57e-6, 16.66e-6, 29.26e-6)
-    arm: float = 0.046
-    largest_thrust: float = 0.15
-    rotor_torque: float = 0.00596
-    rotor_lag: float = 0.03
-    drag: float = 0.01
+    mass: float = bounded(0.028, above=0.0, unit="kg")
+    inertia: tuple[float, float, float] = bounded((16.57e-6, 16.66e-6, 29.26e-6), shape=(3,), above=0.0)
+    arm: float = bounded(0.046, above=0.0, unit="m")
+    largest_thrust: float = bounded(0.15, above=0.0, unit="N")
+    rotor_torque: float = bounded(0.00596, least=0.0, unit="m")
+    rotor_lag: float = bounded(0.03, above=0.0, unit="s")
+    drag: float = bounded(0.01, least=0.0, unit="N s/m")
 
     def __post_init__(self):
-        numbers = {**vars(self), "inertia": min(self.inertia)}
-        for name, value in numbers.items():
-            least = 0.0 if name in ("drag", "rotor_torque") else 1e-9
-            if not (math.isfinite(value) and value >= least):
-                raise ValueError(f"airframe: {name} = {value!r}: it must be finite and above 0")
+        check(self, title="airframe: ")
         if 4.0 * self.largest_thrust <= 1.1 * GRAVITY * self.mass:
             raise ValueError(
                 f"airframe: four rotors of {self.largest_thrust:g} N cannot lift {self.mass:g} kg and steer"

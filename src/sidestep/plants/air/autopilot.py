@@ -9,6 +9,7 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._bounds import bounded, check
 from sidestep.plants.air.airframe import Airframe
 from sidestep.world.flyers import GRAVITY
 
@@ -44,13 +45,16 @@ class Gains:
     - `largest_tilt` rad: the thrust never leans over more
     """
 
-    position: float = 4.0
-    velocity: float = 6.0
-    integral: float = 3.0
-    integral_limit: float = 1.0
-    attitude: float = 340.0
-    rates: float = 30.0
-    largest_tilt: float = math.radians(45.0)
+    position: float = bounded(4.0, above=0.0, unit="1/s")
+    velocity: float = bounded(6.0, above=0.0, unit="1/s")
+    integral: float = bounded(3.0, least=0.0, unit="1/s^2")
+    integral_limit: float = bounded(1.0, least=0.0, unit="m/s^2")
+    attitude: float = bounded(340.0, above=0.0, unit="1/s^2")
+    rates: float = bounded(30.0, above=0.0, unit="1/s")
+    largest_tilt: float = bounded(math.radians(45.0), above=0.0, below=math.pi / 2.0, unit="rad")
+
+    def __post_init__(self):
+        check(self, title="gains: ")
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

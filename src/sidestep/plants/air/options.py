@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from sidestep._bounds import DISTANCE, WIND, bounded, check
 from sidestep.plants.air.airframe import Airframe
 from sidestep.plants.air.autopilot import Gains
 from sidestep.plants.library import TwinError
-from sidestep.plants.options import check_options
+from sidestep.plants.options import PHYSICS_STEP, SEEN
 from sidestep.plants.sensors import Sensors
 from sidestep.safety import Budget
 from sidestep.world import Scenario
@@ -37,26 +38,23 @@ class FlightOptions:
     airframe: Airframe = field(default_factory=Airframe)
     gains: Gains = field(default_factory=Gains)
     sensors: Sensors = ROOM_SENSORS
-    tracking_error: float = 0.04
-    acceleration_noise: float = 0.02
-    tilt_bias: float = math.radians(0.3)
-    wind: tuple[float, float] = (0.0, 0.0)
-    pursuer_lag: float = 0.1
-    pursuer_sees: str = "truth"
-    height: float = 0.8
-    physics_step: float = 0.001
-    autopilot_period: float = 0.002
+    tracking_error: float = bounded(0.04, DISTANCE)
+    acceleration_noise: float = bounded(0.02, least=0.0, unit="m/s^2 per root hertz")
+    tilt_bias: float = bounded(math.radians(0.3), least=0.0, unit="rad")
+    wind: tuple[float, float] = bounded((0.0, 0.0), WIND)
+    pursuer_lag: float = bounded(0.1, above=0.0, unit="s")
+    pursuer_sees: str = bounded("truth", SEEN)
+    height: float = bounded(0.8, above=0.0, unit="m")
+    physics_step: float = bounded(0.001, PHYSICS_STEP)
+    autopilot_period: float = bounded(0.002, above=0.0, most=0.01, unit="s")
 
     def __post_init__(self):
-        not_negative = ("tracking_error", "acceleration_noise", "tilt_bias")
-        check_options(self, not_negative=not_negative, positive=("pursuer_lag", "height"))
-        if len(self.wind) != 2 or not all(math.isfinite(part) for part in self.wind):
-            raise TwinError(f"wind = {self.wind!r}: it must be two finite numbers, m/s")
+        check(self, error=TwinError)
         ticks = self.autopilot_period / self.physics_step
-        if not (0.0 < self.autopilot_period <= 0.01 and abs(ticks - round(ticks)) < 1e-6 and ticks > 0.5):
+        if abs(ticks - round(ticks)) >= 1e-6 or ticks <= 0.5:
             raise TwinError(
-                f"autopilot_period = {self.autopilot_period!r}: it must be at most 0.01 s, and a multiple of "
-                f"physics_step = {self.physics_step!r}"
+                f"autopilot_period = {self.autopilot_period!r}: it must be a multiple of physics_step = "
+                f"{self.physics_step!r}"
             )
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sidestep._bounds import ACCELERATION, DELAY, bounded, check, one_of
 from sidestep.plants.ground.robots import BASES
 from sidestep.plants.library import TwinError
-from sidestep.plants.options import check_options
+from sidestep.plants.options import PHYSICS_STEP, SEEN
 from sidestep.plants.sensors import SENSORS, Sensors
 from sidestep.world import Scenario
 
@@ -22,20 +23,17 @@ class TwinOptions:
     - `physics_step` s
     """
 
-    base: str = "servo"
+    base: str = bounded("servo", one_of(*BASES))
     sensors: Sensors = SENSORS["motion-capture"]
-    actuation_delay: float = 0.0
-    acceleration: float = 2.0
-    lag: float = 0.02
-    pursuer_lag: float = 0.02
-    pursuer_sees: str = "truth"
-    physics_step: float = 0.001
+    actuation_delay: float = bounded(0.0, DELAY)
+    acceleration: float = bounded(2.0, ACCELERATION)
+    lag: float = bounded(0.02, above=0.0, unit="s")
+    pursuer_lag: float = bounded(0.02, above=0.0, unit="s")
+    pursuer_sees: str = bounded("truth", SEEN)
+    physics_step: float = bounded(0.001, PHYSICS_STEP)
 
     def __post_init__(self):
-        if self.base not in BASES:
-            raise TwinError(f"base = {self.base!r}: it must be one of {', '.join(BASES)}")
-        positive = ("acceleration", "lag", "pursuer_lag")
-        check_options(self, not_negative=("actuation_delay",), positive=positive)
+        check(self, error=TwinError)
 
 
 def bounded_errors(scenario: Scenario, options: TwinOptions) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 
 import equinox as eqx
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sidestep._arrays import Scalar, real, traced
+from sidestep._bounds import DELAY, DISTANCE, HEADING_ERROR, TRACKING_ERROR, check, within
 from sidestep.pursuit.game import CaptureGame
 from sidestep.world.scenario import Scenario
 
@@ -40,20 +40,15 @@ class Budget(eqx.Module):
     pursuer's axis. All numbers are traced: others never recompile.
     """
 
-    position_error: Scalar = eqx.field(converter=real, default=0.0)
-    heading_error: Scalar = eqx.field(converter=real, default=0.0)
-    delay: Scalar = eqx.field(converter=real, default=0.0)
-    tracking_error: Scalar = eqx.field(converter=real, default=0.0)
+    position_error: Scalar = eqx.field(converter=real, default=0.0, metadata=within(DISTANCE))
+    heading_error: Scalar = eqx.field(converter=real, default=0.0, metadata=within(HEADING_ERROR))
+    delay: Scalar = eqx.field(converter=real, default=0.0, metadata=within(DELAY))
+    tracking_error: Scalar = eqx.field(converter=real, default=0.0, metadata=within(TRACKING_ERROR))
     own_motion_predicted: bool = eqx.field(static=True, default=True)
 
     def check(self, scenario: Scenario) -> None:
         """**Raises** `ValueError` for a part that is negative, not finite, or too large."""
-        for name in ("position_error", "heading_error", "delay", "tracking_error"):
-            value = float(getattr(self, name))
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"budget: {name} = {value!r}: it must be a finite number, 0 or more")
-        if float(self.heading_error) >= math.pi / 2.0:
-            raise ValueError(f"budget: heading_error = {float(self.heading_error):g} rad is pi/2 or more")
+        check(self, title="budget: ")
         if float(self.tracking_error) >= float(scenario.evader_speed):
             raise ValueError(
                 f"budget: tracking_error = {float(self.tracking_error):g} m/s is no less than the evader's "

@@ -24,6 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sidestep._bounds import DELAY, DISTANCE, HEADING_ERROR, TRACKING_ERROR, Bound, taken
 from sidestep.safety.certificate.certificate import Certificate
 from sidestep.safety.certificate.claims import claims_of
 from sidestep.safety.certificate.flow_map import seen_from, side_value
@@ -48,6 +49,8 @@ from sidestep.safety.certificate.situation import Situation, plain, situation_of
 from sidestep.safety.certificate.survival import survival
 from sidestep.safety.shields.adapted import covered, of_control_point
 from sidestep.world.scenario import Scenario
+
+_PLACE = Bound(shape=(2,), least=-1e6, most=1e6, unit="m")
 
 
 def certify(
@@ -89,18 +92,14 @@ def certify(
     **Raises** `ValueError` naming the argument, its value and what is allowed.
     """
     tell = progress or (lambda _: None)
-    numbers = {
-        "position_error": position_error, "heading_error": heading_error, "delay": delay,
-        "tracking_error": tracking_error,
-        "target_distance": target_distance, "half_axle": half_axle, "control_period": control_period,
-    }  # fmt: skip
-    for name, value in numbers.items():
-        if value is not None and not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"{name} = {value!r}: it must be a finite number, 0 or more")
-    if heading_error >= math.pi / 2.0:
-        raise ValueError(f"heading_error = {heading_error!r}: it must be less than pi/2 rad")
-    if start is not None and (len(start) != 2 or not all(math.isfinite(value) for value in start)):
-        raise ValueError(f"start = {start!r}: it must be two finite numbers X,Y in the pursuer's frame")
+    for name, value, bound in (
+        ("position_error", position_error, DISTANCE), ("heading_error", heading_error, HEADING_ERROR),
+        ("delay", delay, DELAY), ("tracking_error", tracking_error, TRACKING_ERROR),
+        ("target_distance", target_distance, DISTANCE), ("half_axle", half_axle, DISTANCE),
+        ("control_period", control_period, DELAY), ("start", start, _PLACE),
+    ):  # fmt: skip
+        if value is not None:
+            taken(name, value, bound)
     check_mine(mine)
     situation = situation_of(scenario, half_axle, control_period, walls)
     game = replace(

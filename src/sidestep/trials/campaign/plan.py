@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from sidestep._bounds import did_you_mean
 from sidestep.learning import load_policy, make_options, options_to_dict
 from sidestep.loop.policies import GOAL_SEEKING
 from sidestep.pursuit import make_pursuer
@@ -104,11 +104,9 @@ class _Reader:
         names = list(names)
         for name in table:
             if name not in names:
-                near = difflib.get_close_matches(name, names, n=1)
-                hint = f"; did you mean '{near[0]}'?" if near else "."
-                self.fail(
-                    f"{where}.{name}" if where else name, f"is unknown{hint} Known here: {', '.join(names)}."
-                )
+                hint = did_you_mean(name, names)
+                key = f"{where}.{name}" if where else name
+                self.fail(key, f"is unknown{hint} Known here: {', '.join(names)}.")
 
     def table(self, name: str) -> dict[str, Any]:
         table = self.content.get(name, {})

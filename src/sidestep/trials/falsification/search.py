@@ -13,7 +13,7 @@ import numpy as np
 
 import sidestep
 from sidestep import _interrupts
-from sidestep._arrays import seed_number, whole_number
+from sidestep._bounds import DURATION, EPISODES, check, taken
 from sidestep.learning import load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.safety import Shield, as_shield
@@ -66,10 +66,10 @@ def check_plan(
 ) -> None:
     """**Raises** `ValueError` naming what cannot be searched for, or not for so long, its value and what is
     allowed."""
-    if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
-        raise ValueError(f"minutes = {minutes!r}: it must be a finite number greater than 0")
-    if episodes is not None:
-        whole_number("episodes", episodes)
+    check(plan)
+    for name, value, bound in (("minutes", minutes, DURATION), ("episodes", episodes, EPISODES)):
+        if value is not None:
+            taken(name, value, bound)
     if plan.goal not in GOALS:
         raise ValueError(f"goal = {plan.goal!r}: it must be one of {', '.join(map(repr, GOALS))}")
     if plan.goal == "collision" and scenario.obstacle_count == 0:
@@ -79,10 +79,7 @@ def check_plan(
         raise ValueError(f"attacks = {list(plan.attacks)}: they must be some of {', '.join(ATTACKS)}")
     if len(set(plan.attacks)) < len(plan.attacks):
         raise ValueError(f"attacks = {list(plan.attacks)}: each may be named only once")
-    for name in ("batch", "most"):
-        whole_number(name, getattr(plan, name))
-    seed_number(plan.seed)
-    if not np.isfinite(plan.seconds) or plan.seconds < float(scenario.control_period):
+    if plan.seconds < float(scenario.control_period):
         raise ValueError(f"seconds = {plan.seconds!r}: it must be at least one control period")
 
 

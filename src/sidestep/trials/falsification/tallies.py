@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sidestep._bounds import DURATION, SEED, SIDE_BY_SIDE, bounded
 from sidestep.trials.falsification.attacks import ATTACKS
 
 COUNTERS = (
@@ -34,13 +35,13 @@ class Plan:
     outcome (more only if they get 0.1 mm deeper, or broke no assumption).
     """
 
-    seed: int = 0
+    seed: int = bounded(0, SEED)
     goal: str = "both"
     attacks: tuple[str, ...] = ATTACKS
-    batch: int = 256
-    seconds: float = 60.0
-    most: int = 5
-    guaranteed_clearance: float | None = None
+    batch: int = bounded(256, SIDE_BY_SIDE)
+    seconds: float = bounded(60.0, DURATION)
+    most: int = bounded(5, least=1)
+    guaranteed_clearance: float | None = bounded(None, infinite=True)
 
 
 @dataclass

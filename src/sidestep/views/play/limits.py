@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from sidestep._bounds import VISITORS, bounded
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -17,11 +19,11 @@ class Limits:
       have gone
     """
 
-    visitors: int = 8
-    message_bytes: int = 8192
-    message_rate: float = 150.0
-    message_burst: int = 300
-    pending: int = 64
-    frames_ahead: int = 4
-    recorded_periods: int = 6000
-    silence: float = 60.0
+    visitors: int = bounded(8, VISITORS)
+    message_bytes: int = bounded(8192, least=1)
+    message_rate: float = bounded(150.0, above=0.0, unit="1/s")
+    message_burst: int = bounded(300, least=1)
+    pending: int = bounded(64, least=1)
+    frames_ahead: int = bounded(4, least=1)
+    recorded_periods: int = bounded(6000, least=1)
+    silence: float = bounded(60.0, above=0.0, unit="s")

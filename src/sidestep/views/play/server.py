@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from sidestep._bounds import SEED, bounded, check
 from sidestep._packages import needed
 from sidestep.loop import Trajectory, save_trajectory
 from sidestep.loop.policies import as_policy
@@ -65,7 +66,7 @@ class Hosting:
     policy: Any = "goal-seeking"
     shield: str = "joint"
     pursuer: str = YOU
-    seed: int = 0
+    seed: int = bounded(0, SEED)
     limits: Limits = field(default_factory=Limits)
     allowed_hosts: tuple[str, ...] = ()
     savers: Mapping[str, Saver] = field(default_factory=dict)
@@ -218,8 +219,8 @@ def _check(hosting: Hosting) -> None:
         raise ValueError(f"no shield {hosting.shield!r}; use one of {', '.join(map(repr, SHIELDS))}")
     if hosting.pursuer not in (YOU, *STRATEGIES):
         raise ValueError(f"no pursuer {hosting.pursuer!r}; use {YOU} or one of {', '.join(STRATEGIES)}")
-    if hosting.limits.visitors < 1:
-        raise ValueError(f"visitors = {hosting.limits.visitors}: at least 1 is needed")
+    check(hosting)
+    check(hosting.limits)
 
 
 def _greeting(hosting: Hosting, session: Session, token: str, formats: list[str]) -> dict[str, Any]:

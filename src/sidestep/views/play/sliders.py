@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 
 from sidestep._arrays import real
+from sidestep._bounds import allowed
 from sidestep.safety.certificate.situation import plain
 from sidestep.world import Scenario
 
@@ -30,13 +31,17 @@ class Slider:
     step: float
 
 
+def _slider(name: str, label: str, low: float, high: float, step: float, field: str | None = None) -> Slider:
+    return Slider(name, label, allowed(Scenario)[field or name].unit, low, high, step)
+
+
 SLIDERS = (
-    Slider("evader_speed", "Robot's speed", "m/s", 0.05, 0.4, 0.0002),
-    Slider("pursuer_speed", "Pursuer's wheel speed", "m/s", 0.05, 0.4, 0.001),
-    Slider("pursuer_half_axle", "Pursuer's half axle", "m", 0.05, 0.5, 0.005),
-    Slider("capture_distance", "Capture distance", "m", 0.05, 0.5, 0.001),
-    Slider("collision_distance", "Obstacle's radius", "m", 0.05, 0.5, 0.005),
-    Slider("obstacle_speed", "Obstacle's speed", "m/s", 0.0, 0.1, 0.005),
+    _slider("evader_speed", "Robot's speed", 0.05, 0.4, 0.0002),
+    _slider("pursuer_speed", "Pursuer's wheel speed", 0.05, 0.4, 0.001),
+    _slider("pursuer_half_axle", "Pursuer's half axle", 0.05, 0.5, 0.005),
+    _slider("capture_distance", "Capture distance", 0.05, 0.5, 0.001),
+    _slider("collision_distance", "Obstacle's radius", 0.05, 0.5, 0.005),
+    _slider("obstacle_speed", "Obstacle's speed", 0.0, 0.1, 0.005, field="obstacle_velocity"),
 )
 """What the page offers. `obstacle_speed` is the magnitude of the scenario's `obstacle_velocity`."""
 
