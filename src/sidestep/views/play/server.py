@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sidestep._bounds import SEED, bounded, check
 from sidestep._packages import needed
@@ -22,12 +22,13 @@ from sidestep.loop.policies import as_policy
 from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.views.play.helm import STRATEGIES
 from sidestep.views.play.limits import Limits
-from sidestep.views.play.messages import PACES, YOU
 from sidestep.views.play.origins import is_known_host, is_own_origin
 from sidestep.views.play.programs import Programs
-from sidestep.views.play.session import Session
-from sidestep.views.play.visitor import Gone, Visitor
+from sidestep.views.play.sliders import PACES, YOU
 from sidestep.world import Scenario
+
+if TYPE_CHECKING:
+    from sidestep.views.play.session import Session
 
 STATIC = Path(__file__).with_name("static")
 _ENDLESS = 2**30
@@ -82,12 +83,16 @@ def make_app(hosting: Hosting) -> Any:
     **Raises** `PlayError` when the extra `[play]` is not installed, and `ValueError` for an unknown shield or
     pursuer.
     """
-    needed("starlette", "play", "the live page needs", PlayError)
+    for package in ("msgspec", "starlette"):
+        needed(package, "play", "the live page needs", PlayError)
     from starlette.applications import Starlette
     from starlette.responses import FileResponse, JSONResponse, Response
     from starlette.routing import Mount, Route, WebSocketRoute
     from starlette.staticfiles import StaticFiles
     from starlette.websockets import WebSocketDisconnect
+
+    from sidestep.views.play.session import Session
+    from sidestep.views.play.visitor import Gone, Visitor
 
     _check(hosting)
     limits = hosting.limits

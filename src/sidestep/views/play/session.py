@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any, final
 
 import numpy as np
@@ -12,7 +11,6 @@ from sidestep.safety.filter.status import Status
 from sidestep.views.play import helm
 from sidestep.views.play.limits import Limits
 from sidestep.views.play.messages import (
-    YOU,
     Drive,
     Message,
     MessageError,
@@ -32,11 +30,10 @@ from sidestep.views.play.program import traced
 from sidestep.views.play.programs import Programs
 from sidestep.views.play.recording import Recording
 from sidestep.views.play.score import Score
-from sidestep.views.play.sliders import drifts_at, numbers_of, sliders_for, with_numbers
+from sidestep.views.play.sliders import YOU, drifts_at, numbers_of, sliders_for, with_numbers
 from sidestep.views.play.verdict import quick_verdict, verdict
 from sidestep.world import Scenario
 
-_MODES = {"none": helm.BY_WHEELS, "wheels": helm.BY_WHEELS, "point": helm.BY_POINT}
 _EDGE = 0.4
 """m beyond the square of the starts, where an obstacle turns back."""
 _CLEAR = 1.0
@@ -72,7 +69,7 @@ class Session:
         self.frame_number = 0
         self._random = np.random.default_rng(seed)
         self._recording = Recording(programs.layout.place, programs.layout.told, limits.recorded_periods)
-        self._drive = Drive("none", (0.0, 0.0))
+        self._drive = Drive()
         self._told: dict[str, Any] | None = None
         self._plan: list[list[float]] = []
         self._cut = True
@@ -87,8 +84,8 @@ class Session:
         match message:
             case Drive():
                 self._drive = message
-                if message.mode != "none" and self.pursuer != YOU:
-                    self._pick(Pick(None, YOU))
+                if message != Drive() and self.pursuer != YOU:
+                    self._pick(Pick(pursuer=YOU))
             case Pause(paused):
                 self.paused = paused
             case Step():
@@ -148,14 +145,15 @@ class Session:
 
     def _period(self) -> None:
         program = self.programs[self.shield]
+        mode = helm.BY_WHEELS if self._drive.toward is None else helm.BY_POINT
         vector = program.vector(
             {
                 **self._parts,
                 "held": self._held,
                 "ask": self._count % self.decision_steps == 0,
                 "strategy": helm.STRATEGIES.index("nash" if self.pursuer == YOU else self.pursuer),
-                "mode": _MODES[self._drive.mode] if self.pursuer == YOU else helm.BY_STRATEGY,
-                "wanted": self._drive.wanted,
+                "mode": mode if self.pursuer == YOU else helm.BY_STRATEGY,
+                "wanted": self._drive.toward or self._drive.wheels or (0.0, 0.0),
                 "count": self._count % 2**20,
             }
         )
@@ -275,10 +273,10 @@ class Session:
             raise MessageError("pause first, then drag")
         parts = {name: part.copy() for name, part in self._parts.items()}
         if message.what in ("evader", "target"):
-            parts[message.what] = np.array(message.place)
+            parts[message.what] = np.array(message.to)
         else:
             robot = parts[f"{message.what}s"][message.index]
-            robot[:2] = message.place
+            robot[:2] = message.to
             if message.heading is not None and message.what == "pursuer":
                 robot[2] = (message.heading + np.pi) % (2.0 * np.pi) - np.pi
         self._start = {name: part.copy() for name, part in parts.items()}
@@ -286,16 +284,16 @@ class Session:
         self._begin(parts)
 
     def _restore(self, message: Restore) -> None:
-        self._slide(Numbers(message.numbers.values, defaults=True))
-        self._pick(message.pick)
+        self._slide(Numbers(message.values, defaults=True))
+        self._pick(Pick(message.shield, message.pursuer))
         if message.scene is None:
             return
         scene = message.scene
         parts = {
-            "evader": np.array(scene["evader"][0]),
-            "pursuers": np.array(scene["pursuers"], float).reshape(-1, 3),
-            "obstacles": np.array(scene["obstacles"], float).reshape(-1, 4),
-            "target": np.array(scene["target"][0]),
+            "evader": np.array(scene.evader[0]),
+            "pursuers": np.array(scene.pursuers, float).reshape(-1, 3),
+            "obstacles": np.array(scene.obstacles, float).reshape(-1, 4),
+            "target": np.array(scene.target[0]),
             "time": np.zeros(()),
             "evader_velocity": np.zeros(2),
             "wheel_speeds": np.zeros((self.base.pursuer_count, 2)),
@@ -369,7 +367,7 @@ class Session:
             "verdict": self.verdict.to_dict(),
             "states": self.programs.states,
             "ready": self.ready,
-            "show": asdict(self.show),
+            "show": {"rows": self.show.rows, "plan": self.show.plan},
         }
 
     def record(self) -> tuple[Recording, tuple[np.ndarray, np.ndarray], Scenario, dict[str, Any]]:

@@ -15,6 +15,10 @@ from sidestep._bounds import allowed
 from sidestep.safety.certificate.situation import plain
 from sidestep.world import Scenario
 
+PACES = (0.02, 4.0)
+"""Least and most seconds of the world in one second of the visitor's."""
+YOU = "you"
+"""The pursuer that is the visitor."""
 _TIP_ROOM = 0.3
 """How far (m) from the tip of the capture set an episode starts at least."""
 

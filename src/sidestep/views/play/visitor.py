@@ -182,7 +182,7 @@ class Visitor:
             case Seen(frame):
                 self._outbox.acknowledge(frame)
                 return
-            case Drive() if self.session.pursuer == "you" or message.mode == "none":
+            case Drive() if self.session.pursuer == "you" or message == Drive():
                 self.session.apply(message)
                 return
         if len(self._edits) >= self._limits.pending:
