@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
@@ -10,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sidestep._arrays import length, real
@@ -84,13 +84,14 @@ class Answering:
         scenario = shield.scenario
         self._arrays, fixed = eqx.partition((shield, policy), eqx.is_array)
         m, k = scenario.pursuer_count, scenario.obstacle_count
-        self._shapes: list[tuple[int, ...]] = [(2,), (m, 3), (k, 4), (2,), (2,), (m, 2), (), (2,), (), (), ()]
+        shapes = [(2,), (m, 3), (k, 4), (2,), (2,), (m, 2), (), (2,), (), (), ()]
+        split = ravel_pytree([jnp.zeros(shape, dtype=float) for shape in shapes])[1]
         self._count = m + k
 
         @jax.jit
         def answer(arrays: Any, numbers: Array, memory: Any) -> tuple[Array, Any]:
             shield, policy = eqx.combine(arrays, fixed)
-            parts = self._split(numbers)
+            parts = split(numbers)
             evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
             world = World(evader, pursuers, obstacles, target, time, velocity, wheels)
             wished, ask, flee, delay = parts[7:]
@@ -102,11 +103,6 @@ class Answering:
             return jnp.concatenate([jnp.atleast_1d(part) for part in outcome]), memory
 
         self._compiled = answer
-
-    def _split(self, numbers: Array) -> list[Array]:
-        sizes = [math.prod(shape) for shape in self._shapes]
-        parts = jnp.split(numbers, np.cumsum(sizes)[:-1])
-        return [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
     def __call__(
         self, world: Seen, wished: Numbers, ask: bool, flee: bool, delay: float, memory: Any

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from sidestep._arrays import real
@@ -37,22 +37,17 @@ def bundle_of(tree: Any) -> Bundle:
 def bundled(tree: Any) -> list[Any]:
     """A tree as few arrays: its leaves of the default float type end to end in one, the rest as they are."""
     leaves, shapes = jax.tree.leaves(tree), bundle_of(tree).shapes
-    inside = [jnp.ravel(leaf) for leaf, shape in zip(leaves, shapes, strict=True) if shape is not None]
+    inside = [leaf for leaf, shape in zip(leaves, shapes, strict=True) if shape is not None]
     rest = [leaf for leaf, shape in zip(leaves, shapes, strict=True) if shape is None]
-    return [jnp.concatenate([*inside, jnp.zeros(0, dtype=float)]), *rest]
+    return [ravel_pytree(inside)[0], *rest]
 
 
 def unbundled(parts: list[Any], bundle: Bundle) -> Any:
     """The tree again."""
-    (vector, *rest), begin, leaves = parts, 0, []
-    others = iter(rest)
-    for shape in bundle.shapes:
-        if shape is None:
-            leaves.append(next(others))
-            continue
-        end = begin + math.prod(shape)
-        leaves.append(jnp.reshape(vector[begin:end], shape))
-        begin = end
+    vector, *rest = parts
+    blank = [jnp.zeros(shape, dtype=float) for shape in bundle.shapes if shape is not None]
+    inside, others = iter(ravel_pytree(blank)[1](vector)), iter(rest)
+    leaves = [next(others if shape is None else inside) for shape in bundle.shapes]
     return jax.tree.unflatten(bundle.structure, leaves)
 
 
