@@ -79,9 +79,6 @@ class _Steady(Barrier):
     def alpha(self, scenario, h):
         return 1.2 * h
 
-    def update_memory(self, scenario, evader, robot, memory):
-        return jnp.zeros(())
-
 
 class _AlphaAtZero(_Steady):
     def alpha(self, scenario, h):
@@ -333,6 +330,8 @@ def test_a_barrier_with_the_old_names_still_works_and_says_so():
     with pytest.warns(DeprecationWarning, match="recall is update_memory now"):
         side = PursuitBarrier().recall(scenario, world.evader, world.pursuer, None)
     assert side == PursuitBarrier().update_memory(scenario, world.evader, world.pursuer, None)
+    with pytest.warns(DeprecationWarning, match="recall is update_memory now"):
+        assert RangeBarrier().recall(scenario, world.evader, world.pursuer, None) == 0.0
 
 
 def test_old_names_of_the_game_shield_still_work_and_say_so():

@@ -59,8 +59,7 @@ class Barrier(eqx.Module):
     - rate, how fast (m/s) the other robot lowers h, by this barrier's assumption about its motion
     - alpha(h), how fast (m/s) h may shrink
 
-    `memory ()` is one number per robot, kept from one control period to the next. A barrier without memory
-    leaves it 0.
+    `memory ()` is one number per robot, kept from one control period to the next, for barriers that need one.
 
     Subclasses may still define `approach`, `allowance` and `recall`, the old names of `gradient_and_rate`,
     `alpha` and `update_memory`, with a `DeprecationWarning`.
@@ -98,7 +97,6 @@ class Barrier(eqx.Module):
     def alpha(self, scenario: Scenario, h: Float[AnyArray, "*lanes"]) -> Lanes:
         """How fast (m/s) h may shrink: class K, so alpha(0) = 0 and alpha increases with h."""
 
-    @abc.abstractmethod
     def update_memory(
         self,
         scenario: Scenario,
@@ -106,7 +104,11 @@ class Barrier(eqx.Module):
         robot: Float[AnyArray, "d *lanes"],
         memory: Float[AnyArray, "*lanes"] | None,
     ) -> Lanes:
-        """The memory for this control period, from that of the last one; None at the start of an episode."""
+        """The memory for this control period, from that of the last one; None at the start of an episode.
+
+        0 unless a barrier says otherwise.
+        """
+        return jnp.zeros_like(real(evader)[0])
 
     def row(
         self,
@@ -132,7 +134,7 @@ class Barrier(eqx.Module):
         update = jax.vmap(self.update_memory, in_axes=(None, None, 0, None if memory is None else 0))
         return update(scenario, world.evader, self.robots(world), memory)
 
-    remember = renamed(update_memories, "remember")
+    recall, remember = renamed(update_memory, "recall"), renamed(update_memories, "remember")
 
 
 def _away(
@@ -170,9 +172,6 @@ class ObstacleBarrier(Barrier):
     def alpha(self, scenario: Scenario, h: Any) -> Lanes:
         return scenario.obstacle_gain * h
 
-    def update_memory(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
-        return jnp.zeros_like(real(evader)[0])
-
 
 @final
 class RangeBarrier(Barrier):
@@ -199,6 +198,3 @@ class RangeBarrier(Barrier):
 
     def alpha(self, scenario: Scenario, h: Any) -> Lanes:
         return scenario.pursuer_gain * h
-
-    def update_memory(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
-        return jnp.zeros_like(real(evader)[0])

@@ -70,6 +70,3 @@ class FrameBarrier(Barrier):
 
     def alpha(self, scenario: Scenario, h: Any) -> Lanes:
         return (scenario.pursuer_gain if self.gain is None else self.gain) * h
-
-    def update_memory(self, scenario: Scenario, evader: Any, robot: Any, memory: Any) -> Lanes:
-        return jnp.zeros_like(real(evader)[0])

@@ -155,18 +155,14 @@ class JointShield(Shield):
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 
     @property
-    def _game(self) -> GameShield:
+    def rows_only(self) -> GameShield:
         scenario = eqx.tree_at(lambda s: s.pursuer_gain, self.scenario, self.pursuer_gain)
         return GameShield(scenario, self.budget, nominal_picks_side=True)
-
-    @property
-    def rows_only(self) -> GameShield:
-        return self._game
 
     def init(self, world: World) -> JointMemory:
         count, m = len(self.models), self.scenario.pursuer_count
         return JointMemory(
-            sides=self._game.init(world),
+            sides=self.rows_only.init(world),
             plan=jnp.full(SEGMENTS, CHOICES - 1, jnp.int32),
             age=jnp.zeros_like(world.time),
             clear=jnp.zeros((), bool),
@@ -193,12 +189,12 @@ class JointShield(Shield):
         return result, eqx.tree_at(lambda memory: memory.turn, after, turn.astype(memory.turn.dtype))
 
     def rows(self, world: World, memory: JointMemory) -> BarrierRows:
-        return self._game.rows(world, memory.sides)
+        return self.rows_only.rows(world, memory.sides)
 
     def filter_by_rows(
         self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory
     ) -> tuple[ShieldResult, JointMemory]:
-        result, sides = self._game(world, nominal, memory.sides)
+        result, sides = self.rows_only(world, nominal, memory.sides)
         return result, eqx.tree_at(lambda memory: memory.sides, memory, sides)
 
     def has_plan(self, memory: JointMemory) -> Flag:
@@ -209,7 +205,7 @@ class JointShield(Shield):
         if not self.scenario.pursuer_count:
             return super().plan(world, memory)
         following = memory.sides, memory.plan, memory.age, self.horizon, self.acceleration
-        return path(self.scenario, self._game.filter_unchecked, world, *following)
+        return path(self.scenario, self.rows_only.filter_unchecked, world, *following)
 
     def with_acceleration(self, acceleration: float) -> JointShield:
         return dataclasses.replace(self, acceleration=acceleration)
@@ -219,7 +215,7 @@ class JointShield(Shield):
     ) -> tuple[ShieldResult, JointMemory, Flag]:
         """The answer to a nominal action that is turned aside by `turn`, the next memory, and whether that
         action was accepted."""
-        game = self._game
+        game = self.rows_only
         greedy, sides = game(world, turned(nominal, turn), memory.sides)
         greedy = as_turned(greedy, nominal, turn)
         m = self.scenario.pursuer_count
@@ -362,7 +358,7 @@ class JointShield(Shield):
         paced = eqx.tree_at(lambda scenario: scenario.control_period, self.scenario, period)
         return imagine(
             paced,
-            self._game.filter_unchecked,
+            self.rows_only.filter_unchecked,
             models,
             worlds,
             all_sides,
