@@ -9,36 +9,13 @@ import pytest
 LIMIT = 0.1574
 
 
-# What `joint` does in these, the rows of `game` inside it do.
-_SHARED = (
-    "test_in_heading_mode_the_robot_never_slows_down",
-    "test_barriers_are_listed_pursuers_first",
-    "test_one_broken_world_of_a_batch_does_not_touch_the_others",
-    "test_gradients_through_a_shield_are_finite",
-)
-
-# In float32 only: nothing in them hangs on rounding.
-_TOO_LONG_TWICE = (
-    "test_jit_vmap_and_plain_calls_agree",
-    "test_gradients_stay_finite_on_every_awkward_row",
-    "test_one_broken_world_of_a_batch_does_not_touch_the_others",
-    "test_barriers_are_listed_pursuers_first",
-    "test_between_pursuer_and_obstacle_the_pursuers_row_is_kept_first",
-    "test_in_heading_mode_the_robot_never_slows_down",
-    "test_far_from_everyone_nobody_interferes",
-)
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long to compile is tested by name: `joint` in float64, and what is not about it."""
+    """`slow_with(name="joint")` on a test or a module marks those of its cases that have these parameters."""
     for item in items:
         parameters = getattr(getattr(item, "callspec", None), "params", {})
-        if parameters.get("name") == "joint" and parameters.get("precision"):
-            item.add_marker(pytest.mark.slow)
-        if parameters.get("precision") and getattr(item, "originalname", "") in _TOO_LONG_TWICE:
-            item.add_marker(pytest.mark.slow)
-        if parameters.get("name") == "joint" and getattr(item, "originalname", "") in _SHARED:
-            item.add_marker(pytest.mark.slow)
+        for mark in item.iter_markers("slow_with"):
+            if all(parameters.get(name) == value for name, value in mark.kwargs.items()):
+                item.add_marker(pytest.mark.slow)
 
 
 @dataclass

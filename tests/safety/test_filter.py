@@ -124,6 +124,7 @@ def test_the_leading_row_wins_over_the_others(precision):
     np.testing.assert_allclose(result.action, [0.0, 0.05], atol=2e-6)
 
 
+@pytest.mark.slow_with(precision=True)
 def test_jit_vmap_and_plain_calls_agree(precision, problems):
     dtype = jnp.zeros(()).dtype
     for k, hard, circle in ((6, 2, False), (2, 1, True)):

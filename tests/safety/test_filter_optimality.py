@@ -135,6 +135,7 @@ def test_gradients_are_true_where_they_exist(x64, problems, circle):
 
 
 @pytest.mark.parametrize("circle", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow_with(precision=True)
 def test_gradients_stay_finite_on_every_awkward_row(precision, problems, circle):
     batch = problems(3000, 3, seed=18).cast(jnp.zeros(()).dtype)
     batch.nominal[::7] = 0.0

@@ -24,6 +24,11 @@ from sidestep.safety import (
 from sidestep.world import World, load_scenario
 
 every_shield = pytest.mark.parametrize("name", SHIELDS)
+pytestmark = pytest.mark.slow_with(name="joint", precision=True)
+once = pytest.mark.slow_with(precision=True)
+"""Nothing in it depends on rounding, and it takes long to compile: in float32 only."""
+rows_do_it = pytest.mark.slow_with(name="joint")
+"""What `joint` does in it, the rows of `game` inside it do."""
 
 
 def _scene(evader=(0.0, 0.0), pursuers=((1.0, 0.0, np.pi),), obstacles=()):
@@ -53,6 +58,7 @@ def _call(shield, world, nominal, memory=None):
 
 
 @every_shield
+@once
 def test_far_from_everyone_nobody_interferes(precision, name):
     shield = _shield(name, load_scenario("paper"))
     result = _call(shield, _scene(pursuers=(20.0, 0.0, 0.0), obstacles=(0.0, 20.0, 0.0, 0.0)), [0.1, 0.05])
@@ -71,6 +77,8 @@ def test_the_speed_limit_holds_and_is_reported(precision, name):
 
 
 @every_shield
+@rows_do_it
+@once
 def test_in_heading_mode_the_robot_never_slows_down(precision, name):
     shield = _shield(name, load_scenario("paper", action="heading"))
     for nominal in ([0.1, 0.0], [0.0, 0.0], [0.0, -5.0]):
@@ -79,6 +87,8 @@ def test_in_heading_mode_the_robot_never_slows_down(precision, name):
 
 
 @every_shield
+@rows_do_it
+@once
 def test_barriers_are_listed_pursuers_first(precision, name):
     shield = _shield(name, load_scenario("paper", pursuer_count=2, obstacle_count=3))
     far = [(3.0, 0.0, 0.0), (4.0, 0.0, 0.0)]
@@ -123,6 +133,8 @@ def test_a_world_that_is_no_number_never_passes_the_nominal_action(precision, na
 
 
 @every_shield
+@rows_do_it
+@once
 def test_one_broken_world_of_a_batch_does_not_touch_the_others(precision, name):
     shield = _shield(name, load_scenario("paper"))
     worlds = jax.vmap(lambda x: _scene_at(x))(jnp.array([20.0, np.nan, 0.3]))
@@ -161,6 +173,7 @@ def test_head_on_the_papers_shield_is_lost_where_the_games_is_not(precision):
     assert abs(result.action[1]) > 0.09
 
 
+@once
 def test_between_pursuer_and_obstacle_the_pursuers_row_is_kept_first(precision):
     """The only ways out run into an obstacle: then it is the obstacle's row that gives way."""
     scenario = load_scenario("paper")
@@ -217,6 +230,7 @@ def test_other_gains_speeds_and_distances_never_recompile(name):
 
 
 @every_shield
+@rows_do_it
 def test_gradients_through_a_shield_are_finite(precision, name):
     shield = _shield(name, load_scenario("paper"))
 
