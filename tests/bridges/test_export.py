@@ -124,7 +124,7 @@ def reference(scenario, shield, policy, state):
             state["wish"] if policy is None else jnp.where(known, decide(scenario, policy, world), jnp.nan)
         )
         result, sides = shield(world, nominal, state["sides"])
-        rows, _ = shield._kept_rows(world, nominal, state["sides"])
+        rows = shield.rows(world, sides)
         return nominal, result.action, result.status, sides, rows.normals, rows.offsets
 
     names = ("nominal", "velocity", "status", "sides", "normals", "offsets")

@@ -137,5 +137,5 @@ def test_the_evader_turns_as_commanded_which_moves_nothing():
 
 
 def test_what_the_pursuer_sees_is_checked():
-    with pytest.raises(ValueError, match="truth, measurements"):
+    with pytest.raises(ValueError, match="'truth', 'measurements'"):
         play(Simulation(ROOMY), Onboard(ROOMY, "none", "goal-seeking"), "nash", pursuer_sees="nothing")

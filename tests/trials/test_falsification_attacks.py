@@ -189,7 +189,7 @@ def test_goal_decides_what_counts_as_near():
     start = begin(Target(PAPER, goal_seeking, make_shield("none", PAPER)), PAPER.reset(jax.random.key(0)))
     chases = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), start)
     chases = eqx.tree_at(
-        lambda c: (c.margin, c.pursuer_clearance, c.obstacle_clearance),
+        lambda c: (c.margin, c.tally.pursuer_clearance, c.tally.obstacle_clearance),
         chases,
         (jnp.array([0.1, 0.5]), jnp.array([0.2, 0.5]), jnp.array([0.9, 0.3])),
     )
@@ -242,7 +242,7 @@ def test_planned_attack_drives_what_it_planned():
         alone = play(EMPTY, UNSHIELDED.policy, UNSHIELDED.shield, world, driven, 32)
         assert alone.length == steps or int(chases.outcome[number]) == RUNNING
         least = np.min(np.asarray(alone.events.pursuer_clearance)[:steps])
-        assert least == pytest.approx(float(chases.pursuer_clearance[number]), abs=1e-6)
+        assert least == pytest.approx(float(chases.tally.pursuer_clearance[number]), abs=1e-6)
 
 
 @pytest.mark.slow

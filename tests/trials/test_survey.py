@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sidestep.loop import Period
 from sidestep.safety import ShieldResult, Status
 from sidestep.store.runs import OUTCOMES, RunError
 from sidestep.trials import Evaluation, InterventionMap, load_survey, save_survey, take_survey
@@ -32,7 +33,9 @@ def counted(evader, pursuers, nominal, action, status, running):
         slack=jnp.zeros(lanes),
         intervention=jnp.hypot(change[0], change[1]),
     )
-    sums = add_periods(no_periods(), PAPER, world, nominal, result, jnp.asarray(running))
+    # Wheel speeds and events are not read.
+    period = Period(world, world, nominal, result, None, None, jnp.asarray(running))
+    sums = add_periods(no_periods(), PAPER, period)
     return InterventionMap.of_sums(float(map_reach(PAPER)), np.asarray(sums, np.float64))
 
 
