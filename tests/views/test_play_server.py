@@ -7,6 +7,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
@@ -21,7 +22,8 @@ from sidestep.cli import main
 from sidestep.loop import load_episode
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import PlayError, listen, make_server
-from sidestep.views.play.visitor import Allowance, Outbox
+from sidestep.views.play.session import Session
+from sidestep.views.play.visitor import Allowance, Gone, Outbox, Visitor
 from sidestep.world import Scenario
 
 LIMITS = Limits(visitors=4, message_bytes=2048)
@@ -167,6 +169,7 @@ def test_a_target_that_is_guarded_gives_way_to_another(server, monkeypatch):
             "obstacles": [[1, -1, 0, 0]],
         }
         say(socket, type="restore", shield="none", pursuer="still", scene=scene)
+        expect(socket, "frame", lambda frame: frame["target"] == [40.0, 0.0])
         frame = expect(socket, "frame", lambda frame: frame["target"] != [40.0, 0.0] and frame["pace"] == 1.0)
         assert max(map(abs, frame["target"])) <= 1.5
         assert frame["score"]["tallies"].get("none", {}).get("reached", 0) == 0
@@ -284,6 +287,32 @@ def test_visitors_who_vanish_leave_nothing_behind(server):
         until(lambda: server.visitors() < LIMITS.visitors)
     server.empty()
     assert server.app.state.visitors == {}
+
+
+def test_a_visitor_who_leaves_while_something_is_asked_is_gone(server):
+    session = Session(server.app.state.programs, "none", "nash", LIMITS, 0)
+
+    async def scene():
+        said = False
+
+        async def receive():
+            nonlocal said
+            if said:
+                raise Gone("closed")
+            said = True
+            # Until the clock waits for the next period.
+            await asyncio.sleep(0.03)
+            return '{"type":"pause","paused":true}'
+
+        async def send(text):
+            pass
+
+        with ThreadPoolExecutor(1) as workers:
+            visitor = Visitor(session, LIMITS, workers, receive, send)
+            async with asyncio.timeout(5.0):
+                await visitor.run({"type": "hello"})
+
+    asyncio.run(scene())
 
 
 def test_a_slow_visitor_gets_the_latest_frame_and_no_backlog():

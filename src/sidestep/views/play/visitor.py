@@ -251,8 +251,10 @@ class Visitor:
         self._asked.clear()
         if self._edits:
             return
+        # Not wait_for: before Python 3.12 it drops a cancellation that comes with what it waits for.
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._asked.wait(), seconds)
+            async with asyncio.timeout(seconds):
+                await self._asked.wait()
 
     def _say(self, frame: dict[str, Any]) -> None:
         self._outbox.put(frame)
