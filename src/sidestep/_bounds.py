@@ -145,13 +145,13 @@ def bounded(default: Any, rule: Bound | Kind | None = None, **limits: Any) -> An
 
 def allowed(owner: Any) -> dict[str, Any]:
     """What each field of a dataclass may hold, a `Bound` or `Kind`: as declared, or by its default for flags
-    and texts; None for what is no number and declares nothing.
+    and texts; None for what is no number and declares nothing, and for what may be `Any`.
 
     **Raises** `TypeError` for a numeric field that declares nothing.
     """
     rules: dict[str, Any] = {}
     for field in dataclasses.fields(owner):
-        by_default = {bool: _FLAG, str: _TEXT}.get(type(field.default))
+        by_default = None if "Any" in str(field.type) else {bool: _FLAG, str: _TEXT}.get(type(field.default))
         rules[field.name] = rule = field.metadata.get("allowed", by_default)
         if rule is None and _NUMERIC.search(str(field.type)):
             raise TypeError(

@@ -20,6 +20,7 @@ from websockets.sync.client import connect
 
 from sidestep.cli import main
 from sidestep.loop import load_episode
+from sidestep.loop.policies import as_policy
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import PlayError, listen, make_server
 from sidestep.views.play.session import Session
@@ -365,6 +366,12 @@ def test_an_allowance_fills_with_time_and_no_further_than_its_burst():
 def test_what_cannot_be_played_is_refused_at_the_start(field, value):
     with pytest.raises(ValueError, match=value):
         make_app(Hosting(Scenario(), **{field: value}))
+
+
+def test_a_policy_that_is_no_name_is_played():
+    policy = as_policy("goal-seeking", Scenario())
+    assert not isinstance(policy, str)
+    assert make_app(Hosting(Scenario(), policy=policy, shield="none")).state.visitors == {}
 
 
 def test_the_command_refuses_with_words_and_status_2(capsys):
