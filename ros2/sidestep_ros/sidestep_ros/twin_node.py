@@ -1,5 +1,6 @@
 """The twin node: robots to try the other nodes on. It publishes poses and obeys commands, in real time."""
 
+import itertools
 import math
 import sys
 from typing import Any, final
@@ -80,11 +81,11 @@ class TwinNode(Node):
             raise ConfigurationError([f"'pursuer': {error}"]) from error
 
         @eqx.filter_jit
-        def wheels(scenario: Any, world: Any, key: Any) -> Any:
-            return pursue(scenario, strategy, world, key)
+        def wheels(scenario: Any, world: Any, key: Any, asked: Any) -> Any:
+            return pursue(scenario, strategy, world, jax.random.fold_in(key, asked))
 
-        key = jax.random.key(self.values["seed"])
-        return lambda world: np.asarray(wheels(self.scenario, world, key))
+        key, asked = jax.random.key(self.values["seed"]), itertools.count()
+        return lambda world: np.asarray(wheels(self.scenario, world, key, np.int32(next(asked))))
 
     def _make_start(self) -> Any:
         import equinox as eqx

@@ -1,12 +1,17 @@
 """The whole loop, robot to node to robot, live: nothing late may go unreported."""
 
 import time
+from types import SimpleNamespace
 
+import jax
+import numpy as np
 import pytest
 from conftest import Spinner, wait_until
 from sidestep_ros.recorder import Recorder, values_of
+from sidestep_ros.twin_node import TwinNode
 
 from sidestep.bridges.logs import load_log
+from sidestep.world import load_scenario
 
 SECONDS = 10.0
 
@@ -46,3 +51,12 @@ def test_loop_with_the_twin_reports_every_late_command(middleware, start, report
     assert float(log.scenario.control_period) == pytest.approx(1 / rate)
     assert log.trajectory.length >= summary["commands"]
     assert log.about["shield"] == "joint"
+
+
+def test_a_pursuer_that_draws_draws_anew_every_time():
+    node = SimpleNamespace(values={"seed": 0}, scenario=load_scenario("paper"))
+    wheels_for = TwinNode._make_pursuer(node, "random")
+    world = node.scenario.reset(jax.random.key(0))
+    drawn = [wheels_for(world) for _ in range(4)]
+    assert len({wheels.tobytes() for wheels in drawn}) == 4
+    np.testing.assert_array_less(np.abs(drawn), 0.2 + 1e-6)
