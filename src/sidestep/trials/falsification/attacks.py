@@ -83,6 +83,14 @@ def _starts(target: Target, key: PRNGKeyArray, count: int, edge_share: float) ->
     return draw_starts(target.scenario, jax.random.split(key, count), edge)
 
 
+def _chased(
+    target: Target, pursuer: Any, parts: Any, starts: World, periods: int, key: PRNGKeyArray
+) -> Round:
+    """A chase to its end from every start, by `pursuer` with that chase's part of `parts`."""
+    keys = jax.random.split(key, starts.evader.shape[0])
+    return _round(starts, *run_from(target, pursuer, parts, starts, periods, keys))
+
+
 @final
 class Strategies(Attack):
     """The built-in strategies in turn, from random starts and a quarter from the edge of the capture set."""
@@ -95,8 +103,7 @@ class Strategies(Attack):
         start_key, chase_key = jax.random.split(key)
         starts = _starts(target, start_key, self.chases, 0.25)
         numbers = jnp.arange(self.chases, dtype=jnp.int32) % len(self.roster.strategies)
-        keys = jax.random.split(chase_key, self.chases)
-        return None, _round(starts, *run_from(target, self.roster, numbers, starts, self.periods, keys))
+        return None, _chased(target, self.roster, numbers, starts, self.periods, chase_key)
 
 
 @final
@@ -111,8 +118,7 @@ class Herding(Attack):
         starts = _starts(target, start_key, self.chases, 0.25)
         angles = jax.random.uniform(angle_key, (self.chases,), dtype=float, minval=0.2, maxval=1.2)
         parts = (jax.random.bernoulli(way_key, 0.3, (self.chases,)), angles)
-        keys = jax.random.split(chase_key, self.chases)
-        return None, _round(starts, *run_from(target, herder, parts, starts, self.periods, keys))
+        return None, _chased(target, herder, parts, starts, self.periods, chase_key)
 
 
 @final
@@ -128,9 +134,7 @@ class Sideswiping(Attack):
         count = (self.chases,)
         patience = jax.random.uniform(patience_key, count, dtype=float, minval=0.1, maxval=1.2)
         lead = jax.random.uniform(lead_key, count, dtype=float, minval=-1.3, maxval=1.3)
-        keys = jax.random.split(chase_key, self.chases)
-        run_to_end = run_from(target, sideswiper, (patience, lead), starts, self.periods, keys)
-        return None, _round(starts, *run_to_end)
+        return None, _chased(target, sideswiper, (patience, lead), starts, self.periods, chase_key)
 
 
 @eqx.filter_jit
@@ -151,7 +155,7 @@ class BangBang(Attack):
         keys = jax.random.split(plan_key, self.chases)
         plans = _bang_bang_plans(target.scenario, keys, self.periods, real(40.0))
         parts = (plans, jnp.zeros(self.chases, jnp.int32))
-        return None, _round(starts, *run_from(target, script, parts, starts, self.periods, keys))
+        return None, _chased(target, script, parts, starts, self.periods, plan_key)
 
 
 @final
