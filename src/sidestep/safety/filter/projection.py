@@ -10,7 +10,7 @@ no branch and no matrix product (which a GPU would round to TF32): everything wo
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -49,6 +49,18 @@ class _Answer(eqx.Module):
     x: Lanes
     y: Lanes
     violation: Lanes
+
+
+class _Aim(NamedTuple):
+    """What the answer is to come close to, in units of the speed limit.
+
+    `scaled` the nominal action, cut far out, where only its direction matters; `start` its projection on the
+    disc or circle; `weight` of the distance measure, see `_aim`.
+    """
+
+    scaled: _Pair
+    start: _Pair
+    weight: Lanes
 
 
 def tolerance(dtype: Any) -> float:
@@ -105,18 +117,18 @@ def project(
 
     moving = limit > 0.0
     unit = jnp.where(moving, limit, 1.0)
-    scaled, start, weight, unchanged = _aim(wanted, unit, circle)
+    aim, unchanged = _aim(wanted, unit, circle)
     rows, void = _normalise(x, y, c, unit)
     never = fold(jnp.logical_or, void & (c > tolerance(dtype) * unit), False)
 
-    answer, given_way = _solve(scaled, start, weight, rows, hard, circle)
+    answer, given_way = _solve(aim, rows, hard, circle)
 
     infeasible = (given_way > tolerance(dtype)) | (answer.violation > tolerance(dtype))
     # A robot that cannot move has one action: zero.
     infeasible = never | jnp.where(moving, infeasible, fold(jnp.logical_or, c > 0.0, False))
     stopped = (wanted[0] == 0.0) & (wanted[1] == 0.0)
     kept = ~infeasible & (
-        jnp.where(moving, unchanged & (answer.x == start[0]) & (answer.y == start[1]), stopped)
+        jnp.where(moving, unchanged & (answer.x == aim.start[0]) & (answer.y == aim.start[1]), stopped)
     )
     action = jnp.where(kept, wanted[0], answer.x * limit), jnp.where(kept, wanted[1], answer.y * limit)
     status = jnp.where(
@@ -142,37 +154,30 @@ def project_known(
     **Arguments:** as for `project`, but everything finite, normals of unit length, |nominal| <= the limit,
     and that more than 0.
     """
-    scaled, weight = (nominal[0] / speed_limit, nominal[1] / speed_limit), jnp.zeros_like(nominal[0])
-    start = scaled
     if circle:
-        scaled, start, weight, _ = _aim((nominal[0], nominal[1]), speed_limit, circle)
+        aim, _ = _aim((nominal[0], nominal[1]), speed_limit, circle)
+    else:
+        scaled = nominal[0] / speed_limit, nominal[1] / speed_limit
+        aim = _Aim(scaled, scaled, jnp.zeros_like(nominal[0]))
     rows = Rows(normals[:, 0], normals[:, 1], offsets / speed_limit)
-    answer, _ = _solve(scaled, start, weight, rows, hard, circle)
+    answer, _ = _solve(aim, rows, hard, circle)
     return stack(speed_limit * answer.x, speed_limit * answer.y)
 
 
-def _solve(
-    scaled: _Pair,
-    start: _Pair,
-    weight: Lanes,
-    rows: Rows,
-    hard: int,
-    circle: bool,
-) -> tuple[_Answer, Lanes]:
+def _solve(aim: _Aim, rows: Rows, hard: int, circle: bool) -> tuple[_Answer, Lanes]:
     """The best action, and by how much rows had to give way for it, both in units of the speed limit."""
-    relaxed, given_way = rows, jnp.zeros_like(weight)
+    relaxed, given_way = rows, jnp.zeros_like(aim.weight)
     for first, last in ((0, hard), (hard, rows.c.shape[0])):
         if first < last:
             # Harder rows already have their final offsets; softer ones do not count yet.
             tier, level = relax(part(relaxed, 0, last), first, circle)
             relaxed = Rows(*(jnp.concatenate([a, b[last:]]) for a, b in zip(tier, relaxed, strict=True)))
             given_way = jnp.maximum(given_way, level)
-    return _closest(scaled, start, weight, relaxed, hard, circle), given_way
+    return _closest(aim, relaxed, hard, circle), given_way
 
 
-def _aim(nominal: _Pair, unit: Scalar, circle: bool) -> tuple[_Pair, _Pair, Lanes, Bool[Array, "*lanes"]]:
-    """The nominal action in units of the limit (cut far out, where only its direction matters), its
-    projection on the disc or circle, the weight of the distance measure, and whether it is there already.
+def _aim(nominal: _Pair, unit: Scalar, circle: bool) -> tuple[_Aim, Bool[Array, "*lanes"]]:
+    """What to come close to, and whether the nominal action is on the disc or circle already.
 
     Distances to a far nominal action all look the same in floating point. With q the nominal action, p
     its projection on the disc and w = 1 - 1/|q|, |u - q|^2 is, up to a constant and a positive factor,
@@ -196,7 +201,7 @@ def _aim(nominal: _Pair, unit: Scalar, circle: bool) -> tuple[_Pair, _Pair, Lane
     else:
         inside = speed <= 1.0 + slack
         weight = jnp.where(inside, 0.0, 1.0 - 1.0 / jnp.where(inside, 1.0, speed))
-    return near, (jnp.where(inside, near[0], x), jnp.where(inside, near[1], y)), weight, inside
+    return _Aim(near, (jnp.where(inside, near[0], x), jnp.where(inside, near[1], y)), weight), inside
 
 
 def _normalise(
@@ -226,20 +231,14 @@ def _worst(measure: Callable[[Any, Any], Any], lines: Any, rows: Any) -> Any:
     return jax.tree.map(lambda entry: jnp.max(entry, axis=1), table)
 
 
-def _closest(
-    scaled: _Pair,
-    start: _Pair,
-    weight: Lanes,
-    rows: Rows,
-    hard: int,
-    circle: bool,
-) -> _Answer:
+def _closest(aim: _Aim, rows: Rows, hard: int, circle: bool) -> _Answer:
     """The closest feasible point, given that there is one; if rounding hides it, the least bad candidate.
 
     On line i, u = c_i n_i + t n_i' with n_i' a quarter turn to the left. Row j allows a t >= b there, with
     a = n_i x n_j and b = c_j - c_i n_i.n_j; the disc allows t^2 <= 1 - c_i^2. The closest point of the line
     is the scaled nominal action's t clipped to what all others allow.
     """
+    scaled, start, weight = aim
     if rows.c.shape[0] == 0:
         return _Answer(start[0], start[1], jnp.zeros_like(weight))
     eps = float(jnp.finfo(rows.c.dtype).eps)
