@@ -13,7 +13,21 @@ from sidestep.world import Scenario
 from sidestep.world.loading import scenario_to_dict
 
 UNITS = "positions m, velocities m/s, headings rad counter-clockwise; world axes, x forward, y left"
+WHAT = ("policy+filter", "policy", "filter")
+"""What can be exported."""
+ALONE = "export the policy alone (what='policy', --what policy)"
+"""What to do where a filter cannot be exported."""
 STATUS_WORDS = "0 ok, 1 corrected, 2 infeasible, 3 invalid"
+
+
+def check_what(scenario: Scenario, what: str, policy: object | None) -> None:
+    """**Raises** `ValueError` for an unknown `what`, a missing policy, a scenario that no filter serves."""
+    if what not in WHAT:
+        raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
+    if policy is None and what != "filter":
+        raise ValueError(f"exporting {what!r} needs a policy")
+    if what != "policy":
+        scenario.check_built_in("an exported filter", ALONE)
 
 
 def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:

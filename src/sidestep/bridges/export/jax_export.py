@@ -15,7 +15,7 @@ from jax import export
 
 from sidestep._arrays import real
 from sidestep._packages import needed
-from sidestep.bridges.export.files import facts, write_new
+from sidestep.bridges.export.files import check_what, facts, write_new
 from sidestep.loop.step import decide
 from sidestep.safety import Shield
 from sidestep.world import Scenario, World, observation_size
@@ -49,15 +49,8 @@ def export_jax(
     **Raises** `ValueError` for an unknown `what`, a missing policy, a file that exists, or where flatbuffers
     is not installed.
     """
-    from sidestep.bridges.export.onnx_export import ALONE, WHAT
-
     needed("flatbuffers", "export", "exporting needs")
-    if what not in WHAT:
-        raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
-    if policy is None and what != "filter":
-        raise ValueError(f"exporting {what!r} needs a policy")
-    if what != "policy":
-        scenario.check_built_in("an exported filter", ALONE)
+    check_what(scenario, what, policy)
     programs: dict[str, bytes] = {}
     batched = what == "policy" or shield.takes_lanes
     if what == "policy":

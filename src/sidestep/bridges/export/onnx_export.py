@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.bridges.export.files import as_text, facts, write_new
+from sidestep.bridges.export.files import as_text, check_what, facts, write_new
 from sidestep.bridges.export.filter_graph import CORRECTED, TOLERANCE, Verdict, closest
 from sidestep.bridges.export.graph import OPSET, Graph, Tensor
 from sidestep.bridges.export.pair_graph import closest_of_pair
@@ -19,10 +19,6 @@ from sidestep.safety import GameShield, Status
 from sidestep.world import Scenario, observation_names, observation_size
 
 _STEEP = 1e12
-WHAT = ("policy+filter", "policy", "filter")
-"""What can be exported."""
-ALONE = "export the policy alone (what='policy', --what policy)"
-"""What to do where a filter cannot be exported."""
 _TEXTS = {
     "policy": "observation (see sidestep.world.observe) -> action in [-1, 1]^2, in the policy's frame",
     "filter": "state of the world, wished velocity and sides of the call before (0 at first) -> safe "
@@ -60,12 +56,7 @@ def export_onnx(
     **Raises** `ValueError` for an unknown `what`, a policy of another scenario, a shield or scenario that a
     graph cannot hold, a file that exists, or where onnx is not installed.
     """
-    if what not in WHAT:
-        raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
-    if policy is None and what != "filter":
-        raise ValueError(f"exporting {what!r} needs a policy")
-    if what != "policy":
-        scenario.check_built_in("an exported filter", ALONE)
+    check_what(scenario, what, policy)
     if policy is not None:
         _check_policy(scenario, policy)
     shield = GameShield(scenario) if shield is None else shield
