@@ -10,25 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from sidestep.views.style import (
-    BLUE,
-    FAINT,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    VERMILION,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-)
+from sidestep.views import style
 from speed.timing import tail, tail_exponent
 
-CURVE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
+CURVE_COLOURS = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE)
 MARKERS = ("o", "s", "^", "D")
 
 
@@ -45,8 +30,8 @@ def draw_all(results: dict[str, Any], folder: Path) -> list[Path]:
     for name, (draw, needs) in figures.items():
         there = {need: sections[need] for need in needs if need in sections and _cases(sections[need])}
         if there:
-            with house_style():
-                png, pdf = save(draw(there), folder / name)
+            with style.house_style():
+                png, pdf = style.save(draw(there), folder / name)
             pdf.unlink()
             paths.append(png)
     return paths
@@ -60,7 +45,7 @@ def _cases(section: dict[str, Any]) -> list[dict[str, Any]]:
 def _bars(axes: Axes, values: dict[str, float], unit: str, digits: Callable[[float], str]) -> None:
     """Horizontal bars with their values, largest first; ours in blue."""
     names = sorted(values, key=lambda name: values[name])
-    colours = [BLUE if name.startswith("ours") else GREY for name in names]
+    colours = [style.BLUE if name.startswith("ours") else style.GREY for name in names]
     axes.barh(names, [values[name] for name in names], color=colours, height=0.62)
     for place, name in enumerate(names):
         axes.annotate(
@@ -103,7 +88,7 @@ def speed_figure(sections: dict[str, Any]) -> Any:
         "joint": (_joint, "One decision of a shield"),
     }
     height = 1.9 * ((len(sections) + 1) // 2)
-    figure = new_figure(WIDTH, height)
+    figure = style.new_figure(style.WIDTH, height)
     columns = 1 if len(sections) == 1 else 2
     panels = np.atleast_1d(figure.subplots((len(sections) + 1) // 2, columns)).ravel()
     for axes in panels[len(sections) :]:
@@ -111,7 +96,7 @@ def speed_figure(sections: dict[str, Any]) -> Any:
     used = list(panels[: len(sections)])
     for axes, (name, section) in zip(used, sections.items(), strict=True):
         draw[name][0](axes, section)
-    panel_titles(used, [draw[name][1] for name in sections])
+    style.panel_titles(used, [draw[name][1] for name in sections])
     return figure
 
 
@@ -131,7 +116,7 @@ def _roofline(axes: Axes, section: dict[str, Any]) -> None:
     for name, share in summary["share_of_roofline"].items():
         values[f"ours, {name}"] = share * summary["roofline_updates_per_second"] * per_update
     _bars(axes, values, "GFLOP/s", lambda v: f"{v:.0f}")
-    axes.axvline(max(summary["gflops"].values()), color=INK, linewidth=0.8, linestyle=(0, (2, 2)))
+    axes.axvline(max(summary["gflops"].values()), color=style.INK, linewidth=0.8, linestyle=(0, (2, 2)))
 
 
 def _joint(axes: Axes, section: dict[str, Any]) -> None:
@@ -139,7 +124,7 @@ def _joint(axes: Axes, section: dict[str, Any]) -> None:
     for place, case in enumerate(cases):
         timed = case["latency"]
         low, middle, high = (timed[key] / 1000.0 for key in ("p50", "p99", "worst"))
-        axes.plot([low, high], [place, place], color=FAINT, linewidth=2.0, zorder=1)
+        axes.plot([low, high], [place, place], color=style.FAINT, linewidth=2.0, zorder=1)
         # The numbers lean apart, because a shield that always does the same has them close together.
         marks = (
             (low, "o", "median", "right"),
@@ -148,7 +133,13 @@ def _joint(axes: Axes, section: dict[str, Any]) -> None:
         )
         for value, marker, word, side in marks:
             axes.scatter(
-                value, place, color=BLUE, marker=marker, s=26, zorder=2, label=word if place == 0 else None
+                value,
+                place,
+                color=style.BLUE,
+                marker=marker,
+                s=26,
+                zorder=2,
+                label=word if place == 0 else None,
             )
             axes.annotate(
                 f"{value:.2g}", (value, place), (0, 6), textcoords="offset points", ha=side, fontsize=7
@@ -159,14 +150,14 @@ def _joint(axes: Axes, section: dict[str, Any]) -> None:
     axes.set_xlabel("milliseconds")
     axes.margins(x=0.16)
     axes.legend(loc="lower center", ncols=3, handletextpad=0.2, columnspacing=0.8)
-    light_grid(axes, "x")
+    style.light_grid(axes, "x")
 
 
 def filter_figure(sections: dict[str, Any]) -> Any:
     """Single calls, median to 99 of 100, and problems per second in a batch; two and eight rows."""
     cases = _cases(sections["filter"])
     names = list(dict.fromkeys(case["name"] for case in cases))[::-1]
-    figure = new_figure(WIDTH, 0.7 + 0.32 * len(names))
+    figure = style.new_figure(style.WIDTH, 0.7 + 0.32 * len(names))
     left, right = figure.subplots(1, 2, sharey=True)
     looped = {
         case["name"] for case in cases
@@ -175,7 +166,7 @@ def filter_figure(sections: dict[str, Any]) -> Any:
         settings = case["settings"]
         few = settings["rows"] == min(one["settings"]["rows"] for one in cases)
         place = names.index(case["name"]) + (0.16 if few else -0.16)
-        look: dict[str, Any] = {"color": BLUE if few else ORANGE, "marker": "o" if few else "s"}
+        look: dict[str, Any] = {"color": style.BLUE if few else style.ORANGE, "marker": "o" if few else "s"}
         if settings["calls"] == "single":
             timed = case["latency"]
             left.plot(
@@ -195,11 +186,11 @@ def filter_figure(sections: dict[str, Any]) -> Any:
         _plain_log(axes)
         axes.set_xlabel(label)
         axes.tick_params(axis="y", length=0)
-        light_grid(axes)
+        style.light_grid(axes)
     handles, labels = left.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     right.legend(unique.values(), unique.keys(), loc="lower right")
-    panel_titles([left, right], ["A single call", "A batch"])
+    style.panel_titles([left, right], ["A single call", "A batch"])
     return figure
 
 
@@ -207,7 +198,9 @@ def _draw_fit(axes: Axes, points: Sequence[tuple[float | int, float]], power: fl
     """The power law through the sizes it was fitted to."""
     sizes, spent = np.log(np.asarray(points, float).T)
     middle = np.mean(spent) + power * (sizes - np.mean(sizes))
-    axes.plot(np.exp(sizes), np.exp(middle), color=INK, linewidth=0.9, linestyle=(0, (2, 1.5)), zorder=3)
+    axes.plot(
+        np.exp(sizes), np.exp(middle), color=style.INK, linewidth=0.9, linestyle=(0, (2, 1.5)), zorder=3
+    )
 
 
 PANELS = {
@@ -249,7 +242,7 @@ def _growth(
     cases = _cases(section)
     kinds = [kind for kind in PANELS if any(case["settings"]["curve"] == kind for case in cases)]
     rows = (len(kinds) + 2) // 3
-    figure = new_figure(WIDTH, 2.2 * rows)
+    figure = style.new_figure(style.WIDTH, 2.2 * rows)
     panels = np.atleast_1d(figure.subplots(rows, min(3, len(kinds)))).ravel()
     for axes in panels[len(kinds) :]:
         axes.set_axis_off()
@@ -283,6 +276,6 @@ def _growth(
             axes.set_ylim(0.0, high * (1.0 + room))
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper left", fontsize=6.5, borderaxespad=0.1, labelspacing=0.2)
-        light_grid(axes)
-    panel_titles(list(panels[: len(kinds)]), [PANELS[kind] for kind in kinds])
+        style.light_grid(axes)
+    style.panel_titles(list(panels[: len(kinds)]), [PANELS[kind] for kind in kinds])
     return figure

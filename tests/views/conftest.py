@@ -97,3 +97,20 @@ def survey_of(chase):
         return Survey(evaluation, 7, worst)
 
     return survey_of
+
+
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """`drawn(draw)`: the figure that `draw(path)` would have saved, with its labels placed."""
+    from sidestep.views import style
+    from sidestep.views.labels import place_labels
+
+    def drawn(draw):
+        figures = []
+        with monkeypatch.context() as patch:
+            patch.setattr(style, "save", lambda figure, path: (figures.append(figure), (path, path))[1])
+            draw(tmp_path / "x")
+        place_labels(figures[0])
+        return figures[0]
+
+    return drawn

@@ -28,17 +28,16 @@ def test_figure_of_any_episode_shows_something(tmp_path, chase, parts):
     assert matplotlib.get_backend().lower() == "agg"
 
 
-def test_title_says_what_happened_and_when(tmp_path, chase, monkeypatch):
-    seen = []
-    place = "sidestep.views.counterexample_figure.save"
-    monkeypatch.setattr(place, lambda figure, path: (seen.append(figure), (path, path))[1])
+def test_title_says_what_happened_and_when(chase, drawn):
     lost = chase()
-    counterexample_figure(PAPER, lost, tmp_path / "x", shield="paper", words="Broken: the row")
-    title = seen[0].get_suptitle()
+    figure = drawn(
+        lambda path: counterexample_figure(PAPER, lost, path, shield="paper", words="Broken: the row")
+    )
+    title = figure.get_suptitle()
     assert "Paper's shield: captured after" in title
     assert f"{lost.length * 0.05:.2f} s" in title
     assert "Broken: the row" in title
-    wheels = seen[0].axes[-1]
+    wheels = figure.axes[-1]
     assert wheels.get_xlim()[1] == pytest.approx(lost.length * 0.05)
 
 

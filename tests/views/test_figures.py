@@ -17,16 +17,10 @@ from sidestep.views import (
     safety_rows,
     safety_table,
     scenes_figure,
+    style,
     trajectory_figure,
 )
 from sidestep.views.scene import capture_set_outline, mark_periods
-from sidestep.views.style import (
-    OUTCOME_COLOURS,
-    OUTCOME_MARKERS,
-    shield_colour,
-    shield_dashes,
-    shield_words,
-)
 from sidestep.world import Scenario
 from sidestep.world.capture_geometry import capture_set_distance
 
@@ -75,29 +69,18 @@ def test_users_own_matplotlib_settings_are_left_alone_and_ignored(tmp_path, run_
 
 
 def test_outcomes_and_shields_differ_in_shape_as_well_as_in_colour():
-    assert len(set(OUTCOME_MARKERS.values())) == len(set(OUTCOME_COLOURS.values())) == 4
-    assert len({shield_colour(name) for name in SHIELDS}) == len(SHIELDS)
-    assert len({str(shield_dashes(name)) for name in SHIELDS}) == len(SHIELDS)
+    assert len(set(style.OUTCOME_MARKERS.values())) == len(set(style.OUTCOME_COLOURS.values())) == 4
+    assert len({style.shield_colour(name) for name in SHIELDS}) == len(SHIELDS)
+    assert len({str(style.shield_dashes(name)) for name in SHIELDS}) == len(SHIELDS)
 
 
-def drawn(monkeypatch, module, draw):
-    """The figure that `draw` would have saved."""
-    figures = []
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            f"sidestep.views.{module}.save", lambda figure, path: (figures.append(figure), (path, path))[1]
-        )
-        draw()
-    return figures[0]
-
-
-def test_each_shield_keeps_its_colour_whichever_others_are_shown(tmp_path, run_of, monkeypatch):
+def test_each_shield_keeps_its_colour_whichever_others_are_shown(run_of, drawn):
     for shields in (("joint", "none", "game", "paper"), ("joint",), ("game", "joint")):
         runs = [run_of(shield) for shield in shields]
-        figure = drawn(monkeypatch, "training_figures", lambda runs=runs: reward_figure(runs, tmp_path / "x"))
+        figure = drawn(lambda path, runs=runs: reward_figure(runs, path))
         lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
         for shield in shields:
-            assert lines[shield_words(shield)].get_color() == shield_colour(shield)
+            assert lines[style.shield_words(shield)].get_color() == style.shield_colour(shield)
 
 
 def test_safety_table_counts_what_the_metrics_say(tmp_path, run_of):
@@ -116,7 +99,7 @@ def test_safety_table_counts_what_the_metrics_say(tmp_path, run_of):
     assert_fine(safety_table(runs, tmp_path / "safety"))
 
 
-def test_outcome_figure_shows_zero_and_all(tmp_path, monkeypatch):
+def test_outcome_figure_shows_zero_and_all(tmp_path, drawn):
     evaluations = {}
     for shield, captured in (("none", 100), ("paper", 30), ("game", 0), ("joint", 0)):
         evaluations[shield] = report = {}
@@ -132,9 +115,7 @@ def test_outcome_figure_shows_zero_and_all(tmp_path, monkeypatch):
     assert_fine(outcome_figure(evaluations, tmp_path / "outcomes"))
     untrained = {shield: evaluations[shield] for shield in ("game", "joint")}
     assert_fine(outcome_figure(evaluations, tmp_path / "both", untrained))
-    figure = drawn(
-        monkeypatch, "training_figures", lambda: outcome_figure(evaluations, tmp_path / "x", untrained)
-    )
+    figure = drawn(lambda path: outcome_figure(evaluations, path, untrained))
     faces = [line.get_markerfacecolor() for line in figure.axes[0].get_lines() if line.get_marker() == "o"]
     assert len(faces) == 6
     assert faces.count("white") == 2
@@ -151,15 +132,13 @@ def test_trajectory_figure_of_any_company_and_length(tmp_path, obstacles, pursue
     assert_fine(trajectory_figure(PAPER, trajectory, tmp_path / "scene", moment=1e9))
 
 
-def test_trace_shows_every_status_with_its_share(tmp_path, chase, monkeypatch):
+def test_trace_shows_every_status_with_its_share(chase, drawn):
     trajectory = chase(gap=0.5)
     status = np.zeros(trajectory.length, np.int32)
     status[10:15], status[30], status[-1:] = 1, 2, 3
     status[20:22] = 1
     trajectory = replace(trajectory, status=jnp.asarray(status))
-    figure = drawn(
-        monkeypatch, "trajectory_figures", lambda: trajectory_figure(PAPER, trajectory, tmp_path / "x")
-    )
+    figure = drawn(lambda path: trajectory_figure(PAPER, trajectory, path))
     answers = figure.axes[-1]
     spans = [collection.get_paths() for collection in answers.collections]
     assert [len(paths) for paths in spans] == [4, 2, 1, 1]
@@ -171,14 +150,12 @@ def test_trace_shows_every_status_with_its_share(tmp_path, chase, monkeypatch):
 
 
 @pytest.mark.parametrize("shield", ["none", "paper", "game", "joint"])
-def test_level_sets_are_those_of_the_shields_own_barrier(tmp_path, chase, monkeypatch, shield):
+def test_level_sets_are_those_of_the_shields_own_barrier(chase, monkeypatch, shield, drawn):
     asked = []
     place = "sidestep.views.trajectory_figures.draw_barrier_levels"
     monkeypatch.setattr(place, lambda *_, pursuit: asked.append(pursuit))
     drawn(
-        monkeypatch,
-        "trajectory_figures",
-        lambda: trajectory_figure(PAPER, chase(steps=20), tmp_path / "x", shield=shield),
+        lambda path: trajectory_figure(PAPER, chase(steps=20), path, shield=shield),
     )
     assert asked == [shield in ("game", "joint")]
 

@@ -3,7 +3,6 @@ that says safe where nothing is."""
 
 import dataclasses
 import itertools
-import sys
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,22 +29,6 @@ from sidestep.views.style import new_figure
 from sidestep.world import Scenario, load_scenario
 
 PAPER = Scenario()
-
-
-@pytest.fixture
-def drawn(monkeypatch, tmp_path):
-    """`drawn(module, draw)`: the figure that `draw(path)` would have saved, with its labels placed."""
-
-    def drawn(module, draw):
-        figures = []
-        # By its name the package gives the function of the same name, not the module.
-        module = sys.modules[f"sidestep.views.{module}"]
-        monkeypatch.setattr(module, "save", lambda figure, path: (figures.append(figure), (path, path))[1])
-        draw(tmp_path / "x")
-        place_labels(figures[0])
-        return figures[0]
-
-    return drawn
 
 
 @pytest.fixture(scope="module")
@@ -117,16 +100,14 @@ def test_contrast_is_that_of_the_standard():
 
 def test_time_labels_of_a_path_that_circles_do_not_cover_each_other(drawn, circling):
     shields = ("none", "paper", "game", "joint")
-    figure = drawn(
-        "trajectory_figures", lambda path: scenes_figure(PAPER, dict.fromkeys(shields, circling), path)
-    )
+    figure = drawn(lambda path: scenes_figure(PAPER, dict.fromkeys(shields, circling), path))
     assert_legible(figure)
     labels = figure.findobj(Label)
     assert sum(label.get_visible() for label in labels) >= 4 * len(shields)
 
 
 def test_labels_of_a_twin_figure_do_not_cover_each_other(drawn, circling, chase):
-    figure = drawn("twin_figure", lambda path: twin_figure(PAPER, circling, chase(), path, shield="joint"))
+    figure = drawn(lambda path: twin_figure(PAPER, circling, chase(), path, shield="joint"))
     assert_legible(figure)
 
 
@@ -144,7 +125,7 @@ def test_a_label_that_finds_no_room_is_left_out():
 @pytest.mark.parametrize("company", [{}, {"obstacles": 3, "pursuers": 2}, {"obstacles": 0}], ids=str)
 def test_no_level_set_is_cut_by_the_frame(drawn, chase, shield, company):
     episode = chase(**company)
-    figure = drawn("trajectory_figures", lambda path: trajectory_figure(PAPER, episode, path, shield=shield))
+    figure = drawn(lambda path: trajectory_figure(PAPER, episode, path, shield=shield))
     axes = figure.axes[0]
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     levels = [line for line in axes.get_lines() if line.get_zorder() in (0.5, 2.5)]
@@ -165,7 +146,7 @@ def capture_sets(axes):
 
 
 def test_capture_set_lies_over_the_level_that_has_the_same_place(drawn, chase):
-    figure = drawn("trajectory_figures", lambda path: trajectory_figure(PAPER, chase(), path, shield="game"))
+    figure = drawn(lambda path: trajectory_figure(PAPER, chase(), path, shield="game"))
     (line,) = capture_sets(figure.axes[0])
     zero = [one for one in figure.axes[0].get_lines() if one.get_zorder() == 2.5]
     assert all(line.get_zorder() > one.get_zorder() for one in zero)
@@ -175,7 +156,7 @@ def test_capture_set_lies_over_the_level_that_has_the_same_place(drawn, chase):
 
 
 def test_where_it_arrived_is_marked_and_in_the_key(drawn, circling):
-    figure = drawn("trajectory_figures", lambda path: trajectory_figure(PAPER, circling, path, shield="game"))
+    figure = drawn(lambda path: trajectory_figure(PAPER, circling, path, shield="game"))
     end = np.asarray(circling.worlds.evader[-1])
     marks = [line for line in figure.axes[0].get_lines() if line.get_marker() == "D"]
     assert [tuple(line.get_xydata()[0]) for line in marks] == [pytest.approx(tuple(end))]
@@ -185,7 +166,7 @@ def test_where_it_arrived_is_marked_and_in_the_key(drawn, circling):
 
 def test_distances_of_a_twin_are_drawn_whole(drawn, circling, chase):
     for twin in (circling, chase(gap=3.0, steps=60)):
-        figure = drawn("twin_figure", lambda path, twin=twin: twin_figure(PAPER, circling, twin, path))
+        figure = drawn(lambda path, twin=twin: twin_figure(PAPER, circling, twin, path))
         for axes in figure.axes[-2:]:
             low, high = axes.get_ylim()
             for line in axes.get_lines():
@@ -204,7 +185,7 @@ def test_palest_colour_of_a_map_is_seen_on_white(colours):
 def test_returns_are_shown_as_they_were_beside_their_mean(drawn, run_of):
     outcomes = ["reached"] * 60 + ["captured"] * 5 + ["reached"] * 60
     run = run_of("joint", outcomes)
-    figure = drawn("training_figures", lambda path: reward_figure([run], path))
+    figure = drawn(lambda path: reward_figure([run], path))
     assert_legible(figure)
     assert "mean" in figure.axes[0].get_title("left").lower()
     shown = sum(
@@ -223,10 +204,7 @@ def test_no_place_is_tinted_as_safe_where_the_pursuer_wins(drawn):
     lost = certify(load_scenario("paper", **fields), check_shield=False)
     kept = certify(load_scenario("paper"), check_shield=False)
     assert lost.pursuer_wins
-    figures = [
-        drawn("certificate_figure", lambda path, one=one: certificate_figure(one, path))
-        for one in (lost, kept)
-    ]
+    figures = [drawn(lambda path, one=one: certificate_figure(one, path)) for one in (lost, kept)]
     tints = [to_rgba(figure.axes[0].get_facecolor()) for figure in figures]
     red, green, _, _ = tints[0]
     assert red > green

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from sidestep.plants.drawing import Decor, camera_over, rgba, thinned
 from sidestep.plants.library import load_av, load_mujoco, make_renderer
-from sidestep.views.style import EVADER, OBSTACLE, PURSUER, TARGET
+from sidestep.views import style
 from sidestep.views.video_files import write_video_file
 
 _SIZE = (540, 960)
@@ -45,7 +45,7 @@ def frames_of(
         mujoco, np.concatenate([paths[near], target[None]]), max(capture, collision) + 0.05, field,
         size[1] / size[0], tall=look.tall, tilt=look.tilt,
     )  # fmt: skip
-    evader, pursuer, obstacle, green = map(rgba, (EVADER, PURSUER, OBSTACLE, TARGET))
+    evader, pursuer, obstacle, green = map(rgba, (style.EVADER, style.PURSUER, style.OBSTACLE, style.TARGET))
     with closing(make_renderer(plant.model, *size, _MOST_DECOR)) as renderer:
         for time in times:
             frame = min(int(np.searchsorted(episode.frame_times, time)), len(paths) - 1)

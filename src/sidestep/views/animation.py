@@ -9,7 +9,8 @@ import numpy as np
 
 from sidestep._bounds import SPEED_UP, Bound, taken
 from sidestep.loop import Trajectory
-from sidestep.views.stage import LEVELS, Stage
+from sidestep.views.scene import LEVELS
+from sidestep.views.stage import Stage
 from sidestep.views.video_files import HOLD, VideoError, check_video, write_video_file
 from sidestep.world import Scenario
 

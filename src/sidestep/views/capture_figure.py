@@ -10,24 +10,13 @@ from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
 from sidestep.loop import Trajectory
 from sidestep.trials import Capture, explain_capture
+from sidestep.views import style
 from sidestep.views.scene import (
     draw_capture_set,
     draw_pursuer,
     draw_time_marks,
     mark_periods,
     set_limits,
-)
-from sidestep.views.style import (
-    EVADER,
-    INK,
-    ORANGE,
-    PURSUER,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
 )
 from sidestep.world import Scenario
 
@@ -43,8 +32,8 @@ def capture_figure(scenario: Scenario, trajectory: Trajectory, path: str | Path)
     **Raises** `ValueError` when the episode did not end in a capture.
     """
     capture = explain_capture(scenario, trajectory)
-    with house_style():
-        figure = new_figure(WIDTH, 5.8)
+    with style.house_style():
+        figure = style.new_figure(style.WIDTH, 5.8)
         grid = figure.add_gridspec(3, 2, height_ratios=[1.45, 1.0, 0.26])
         scene, plane, speeds, key = (
             figure.add_subplot(grid[0, 0]),
@@ -56,12 +45,12 @@ def capture_figure(scenario: Scenario, trajectory: Trajectory, path: str | Path)
         _draw_velocity_plane(plane, scenario, trajectory, capture)
         _draw_speeds(speeds, key, scenario, trajectory, capture)
         when = (trajectory.length - 1) * float(scenario.control_period)
-        panel_titles(
+        style.panel_titles(
             [scene, plane, speeds],
             ["The last seconds", f"What it could do at {when:.1f} s", "Speed away from the pursuer"],
             in_caption=True,
         )
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def _first_shown(scenario: Scenario, trajectory: Trajectory) -> int:
@@ -91,22 +80,18 @@ def _draw_last_seconds(axes: Axes, scenario: Scenario, trajectory: Trajectory, c
     centre, half = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0).max() / 2
     set_limits(axes, np.stack([centre - half, centre + half]), 0.06)
     draw_capture_set(axes, scenario, poses[-1])
-    axes.plot(*poses[:, :2].T, color=PURSUER, linewidth=1.4, zorder=4)
-    axes.plot(*evader.T, color=EVADER, linewidth=1.4, zorder=4)
+    axes.plot(*poses[:, :2].T, color=style.PURSUER, linewidth=1.4, zorder=4)
+    axes.plot(*evader.T, color=style.EVADER, linewidth=1.4, zorder=4)
     size = 0.055 * float(np.ptp(axes.get_xlim()))
     for mark in marks:
         draw_pursuer(axes, poses[mark], size=size)
     draw_pursuer(axes, poses[-1], size=1.5 * size)
-    _time_labels(axes, evader, marks, first, length, EVADER, dots=True)
-    _time_labels(axes, poses[:, :2], marks, first, length, PURSUER, dots=False)
+    _time_labels(axes, evader, marks, first, length, style.EVADER, dots=True)
+    _time_labels(axes, poses[:, :2], marks, first, length, style.PURSUER, dots=False)
     late = capture.decisive_period - first
     if late >= 0:
-        axes.plot(
-            *evader[late], "o", color=EVADER, markersize=5, markeredgecolor=INK, markeredgewidth=0.9, zorder=9
-        )
-    axes.plot(
-        *evader[-1], "X", color=PURSUER, markersize=9, markeredgecolor="white", markeredgewidth=0.8, zorder=9
-    )
+        axes.plot(*evader[late], "o", zorder=9, **style.mark(style.EVADER, 5, style.INK, 0.9))
+    axes.plot(*evader[-1], "X", zorder=9, **style.mark(style.PURSUER, 9))
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
 
@@ -137,22 +122,24 @@ def _draw_velocity_plane(axes: Axes, scenario: Scenario, trajectory: Trajectory,
     axes.add_patch(
         Polygon(
             [(edge, bottom), (right, bottom), (right, top), (edge, top)],
-            facecolor=ORANGE,
+            facecolor=style.ORANGE,
             alpha=0.15,
             linewidth=0,
         )
     )
-    axes.add_patch(Circle((0.0, 0.0), limit, facecolor=EVADER, alpha=0.12, linewidth=0))
-    axes.add_patch(Circle((0.0, 0.0), limit, fill=False, edgecolor=EVADER, linewidth=1.2))
-    axes.text(0.0, -1.15 * limit, "all the evader can do", color=EVADER, fontsize=7, ha="center", va="top")
+    axes.add_patch(Circle((0.0, 0.0), limit, facecolor=style.EVADER, alpha=0.12, linewidth=0))
+    axes.add_patch(Circle((0.0, 0.0), limit, fill=False, edgecolor=style.EVADER, linewidth=1.2))
+    axes.text(
+        0.0, -1.15 * limit, "all the evader can do", color=style.EVADER, fontsize=7, ha="center", va="top"
+    )
     words = {"va": "top", "fontsize": 7, "linespacing": 1.25}
     inset = 0.03 * span
     axes.text(edge + inset, top - inset, "the row\nallows\nthis side", color="#8A5F00", ha="left", **words)
     if expected > left:
-        axes.axvline(expected, color=ORANGE, linewidth=1.6)
+        axes.axvline(expected, color=style.ORANGE, linewidth=1.6)
     if abs(needed - expected) > 1e-3:
-        axes.axvline(needed, color=PURSUER, linewidth=1.6, linestyle=(0, (4, 2)))
-        axes.text(needed + inset, top - inset, "needed:\nthis side", color=PURSUER, ha="left", **words)
+        axes.axvline(needed, color=style.PURSUER, linewidth=1.6, linestyle=(0, (4, 2)))
+        axes.text(needed + inset, top - inset, "needed:\nthis side", color=style.PURSUER, ha="left", **words)
     nominal, action = (
         turned(np.asarray(trajectory.nominal[period])),
         turned(np.asarray(trajectory.action[period])),
@@ -162,14 +149,14 @@ def _draw_velocity_plane(axes: Axes, scenario: Scenario, trajectory: Trajectory,
         axes.annotate(
             "nominal", tuple(nominal), xytext=(3, 5), textcoords="offset points", fontsize=7, color="#777777"
         )
-    _arrow(axes, np.zeros(2), action, INK, 1.8)
+    _arrow(axes, np.zeros(2), action, style.INK, 1.8)
     norm = np.hypot(*action)
     beside = np.array([action[1], -action[0]]) / norm if norm > 0 else np.array([0.0, -1.0])
     axes.annotate(
         "executed", tuple(0.5 * action), xytext=tuple(9 * beside), textcoords="offset points", fontsize=7,
         va="center", ha="center" if abs(beside[1]) > 0.7 else "left" if beside[0] > 0 else "right",
     )  # fmt: skip
-    axes.plot(0.0, 0.0, "o", color=INK, markersize=3)
+    axes.plot(0.0, 0.0, "o", color=style.INK, markersize=3)
     axes.set_xlabel("speed away from the pursuer n·u, m/s")
     axes.set_ylabel("speed across, m/s")
 
@@ -178,26 +165,31 @@ def _draw_speeds(axes: Axes, key: Axes, scenario: Scenario, trajectory: Trajecto
     first, length = _first_shown(scenario, trajectory), float(scenario.control_period)
     times = np.arange(first, trajectory.length) * length
     limit = float(scenario.evader_speed)
-    light_grid(axes, "y")
-    axes.axhline(limit, color=EVADER, linewidth=1.0, linestyle=(0, (4, 2)))
+    style.light_grid(axes, "y")
+    axes.axhline(limit, color=style.EVADER, linewidth=1.0, linestyle=(0, (4, 2)))
     late = capture.decisive_period * length
     if late >= times[0]:
-        axes.axvline(late, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+        axes.axvline(late, color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
         axes.annotate(
             "too slow from here on", (late, 1.0), xycoords=axes.get_xaxis_transform(), xytext=(3, -2),
             textcoords="offset points", va="top", fontsize=7,
         )  # fmt: skip
     curves = (
-        (capture.expected, ORANGE, 2.2, "row asks for: V n·(cos θ, sin θ) − γ h, forwards at V"),
-        (capture.moved, EVADER, 1.4, "executed: n·u"),
-        (capture.needed, PURSUER, 1.8, "truly needed: v n·(cos θ, sin θ) − γ h, the pursuer's own speed v"),
+        (capture.expected, style.ORANGE, 2.2, "row asks for: V n·(cos θ, sin θ) − γ h, forwards at V"),
+        (capture.moved, style.EVADER, 1.4, "executed: n·u"),
+        (
+            capture.needed,
+            style.PURSUER,
+            1.8,
+            "truly needed: v n·(cos θ, sin θ) − γ h, the pursuer's own speed v",
+        ),
     )
     for values, colour, width, label in curves:
         dashes = (0, (4, 2)) if values is capture.needed else "solid"
         axes.plot(times, values[first:], color=colour, linewidth=width, label=label, linestyle=dashes)
     axes.annotate(
         f"all the evader has: {limit:g} m/s", (times[0], limit), xytext=(2, 3), textcoords="offset points",
-        fontsize=7, color=EVADER,
+        fontsize=7, color=style.EVADER,
     )  # fmt: skip
     shown = np.concatenate([values[first:] for values, *_ in curves] + [[limit]])
     low, high = max(shown.min(), -2.5 * limit), shown.max()

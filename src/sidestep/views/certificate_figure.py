@@ -11,33 +11,18 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from sidestep.safety.certificate.certificate import Certificate
+from sidestep.views import style
 from sidestep.views.scene import draw_pursuer, set_limits
-from sidestep.views.style import (
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    PURSUER,
-    SKY,
-    WIDTH,
-    YELLOW,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-)
 
 _SAFE, _LOST = "#EAF5F0", "#FBEDE4"
 _SAFE_TEXT, _LOST_TEXT = "#006B4E", "#9C4400"
 _PARTS = (
-    ("position", "+ position error", YELLOW),
-    ("heading", "+ heading error", ORANGE),
-    ("delay", "+ delay", PURPLE),
-    ("sampling", "+ sampling", SKY),
-    ("tracking", "+ tracking error", GREEN),
-    ("sides", "+ telling sides apart", GREY),
+    ("position", "+ position error", style.YELLOW),
+    ("heading", "+ heading error", style.ORANGE),
+    ("delay", "+ delay", style.PURPLE),
+    ("sampling", "+ sampling", style.SKY),
+    ("tracking", "+ tracking error", style.GREEN),
+    ("sides", "+ telling sides apart", style.GREY),
 )
 
 
@@ -48,10 +33,10 @@ def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path
     +-b cot S; b: the tip, where margins of millimetres can be seen. Where the pursuer wins, one panel: no
     place is safe, so none is tinted as safe. Returns the paths.
     """
-    with house_style():
+    with style.house_style():
         # Where the pursuer wins there is no budget, and the tip would repeat the whole.
         split = not certificate.pursuer_wins
-        figure = new_figure(WIDTH, 4.4)
+        figure = style.new_figure(style.WIDTH, 4.4)
         grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], height_ratios=[1.0, 0.36])
         places = [grid[0, 0], grid[0, 1]] if split else [grid[0, :]]
         panels, key = [figure.add_subplot(place) for place in places], figure.add_subplot(grid[1, :])
@@ -64,13 +49,13 @@ def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path
         key.set_axis_off()
         handles, labels = panels[0].get_legend_handles_labels()
         key.legend(handles, labels, loc="center", ncols=2, borderaxespad=0.0, labelspacing=0.4)
-        panel_titles(
+        style.panel_titles(
             panels,
             [f"Capture at {_wanted(certificate):g} m: {_verdict(certificate)}", "The tip ahead"][
                 : len(panels)
             ],
         )
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def _verdict(certificate: Certificate) -> str:
@@ -107,7 +92,7 @@ def _grown(certificate: Certificate) -> list[tuple[str, str, float]]:
 def _draw_sets(axes: Axes, certificate: Certificate) -> None:
     angle = certificate.situation.game.usable_angle
     axes.set_facecolor(_LOST if certificate.pursuer_wins else _SAFE)
-    light_grid(axes)
+    style.light_grid(axes)
     grown = _grown(certificate)
     for label, colour, radius in reversed(grown):
         outline = set_outline(radius, angle)
@@ -115,21 +100,21 @@ def _draw_sets(axes: Axes, certificate: Certificate) -> None:
     held = _wanted(certificate)
     words = "captured at once, driving straight on" if certificate.pursuer_wins else "capture set K(l)"
     fill = Polygon(
-        set_outline(held, angle), facecolor="#F3C9B5", edgecolor=PURSUER, linewidth=1.2,
+        set_outline(held, angle), facecolor="#F3C9B5", edgecolor=style.PURSUER, linewidth=1.2,
         label=f"{words}, l = {held:g} m",
     )  # fmt: skip
     axes.add_patch(fill)
     limit = certificate.largest_capture_distance
     if math.isfinite(limit) and 0.0 < limit < 3.0 * held:
         axes.plot(
-            *set_outline(limit, angle).T, color=INK, linewidth=1.0, linestyle=(0, (4, 2)),
+            *set_outline(limit, angle).T, color=style.INK, linewidth=1.0, linestyle=(0, (4, 2)),
             label=f"K(l_max), l_max = {limit:.5g} m: the most there is",
         )  # fmt: skip
     control = certificate.control_set
     if control is not None and (certificate.guaranteed or control.level != held):
         words = "is kept out of this set" if certificate.guaranteed else "can be kept out of this set only"
         axes.plot(
-            *set_outline(control.level, control.angle).T, color=GREEN, linewidth=1.4,
+            *set_outline(control.level, control.angle).T, color=style.GREEN, linewidth=1.4,
             label=f"the evader {words}, {control.level:.5g} m",
         )  # fmt: skip
 
@@ -141,17 +126,19 @@ def _draw_pursuer_and_marks(axes: Axes, certificate: Certificate) -> None:
         arc = np.linspace(-angle, angle, 61)
         for end in (1.0, -1.0):
             axes.plot(
-                end * held * np.cos(arc), held * np.sin(arc), color=PURSUER, linewidth=2.6, zorder=4,
+                end * held * np.cos(arc), held * np.sin(arc), color=style.PURSUER, linewidth=2.6, zorder=4,
                 label="usable part" if end > 0 else None,
             )  # fmt: skip
         stand_off = game.half_axle / math.tan(angle)
         axes.plot(
-            [stand_off, -stand_off], [0.0, 0.0], "D", color=INK, markersize=4, linestyle="none", zorder=6,
-            label=f"stand-off b cot S, {stand_off:.4g} m",
+            [stand_off, -stand_off], [0.0, 0.0], "D", color=style.INK, markersize=4, linestyle="none",
+            zorder=6, label=f"stand-off b cot S, {stand_off:.4g} m",
         )  # fmt: skip
     draw_pursuer(axes, np.zeros(3), size=0.5 * held)
     if certificate.start is not None:
-        axes.plot(*certificate.start, "o", color=GREEN, markersize=5, zorder=7, label="start asked about")
+        axes.plot(
+            *certificate.start, "o", color=style.GREEN, markersize=5, zorder=7, label="start asked about"
+        )
 
 
 def _outside(certificate: Certificate) -> tuple[str, str]:

@@ -10,18 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter, NullLocator
 
-from sidestep.views.style import (
-    INK,
-    OUTCOME_COLOURS,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-    shield_colour,
-    shield_words,
-)
+from sidestep.views import style
 
 Clearances = tuple[Float[np.ndarray, "episodes"], Float[np.ndarray, "episodes"]]
 
@@ -55,8 +44,8 @@ def clearance_figure(
         for index in range(len(_HAZARDS))
         if any(np.any(np.isfinite(pair[index])) for pair in clearances.values())
     ]
-    with house_style():
-        figure = new_figure(WIDTH, 0.75 + 0.85 * max(len(names), 1))
+    with style.house_style():
+        figure = style.new_figure(style.WIDTH, 0.75 + 0.85 * max(len(names), 1))
         grid = figure.subplots(
             max(len(names), 1), max(len(hazards), 1), sharex="col", sharey=True, squeeze=False
         )
@@ -66,10 +55,10 @@ def clearance_figure(
             edges = _edges(float(np.max(finite, initial=0.1)))
             for row, name in enumerate(names):
                 axes = grid[row, column]
-                highest = _draw(axes, clearances[name][index], edges, index, shield_colour(name, row))
+                highest = _draw(axes, clearances[name][index], edges, index, style.shield_colour(name, row))
                 most = max(most, highest)
                 if column == 0:
-                    axes.set_ylabel(f"{shield_words(name)}\nepisodes")
+                    axes.set_ylabel(f"{style.shield_words(name)}\nepisodes")
             distance = (capture_distance, collision_distance)[index]
             word = ("capture", "collision")[index]
             grid[-1, column].set_xlabel(f"m beyond the {word} distance of {distance:g} m (√ scale)")
@@ -80,9 +69,9 @@ def clearance_figure(
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_locator(NullLocator())
             axes.yaxis.set_minor_formatter(NullFormatter())
-        panel_titles(list(grid[0]), [_HAZARDS[index][1] for index in hazards] or [""], in_caption=True)
+        style.panel_titles(list(grid[0]), [_HAZARDS[index][1] for index in hazards] or [""], in_caption=True)
         figure.align_ylabels(grid[:, 0])
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def _edges(highest: float) -> Float[np.ndarray, "edges"]:
@@ -107,16 +96,17 @@ def _draw(
     contacts = int(np.sum(finite <= 0.0))
     counts, _ = np.histogram(finite[finite > 0.0], edges)
     places, width = _root(edges), 1.0 / _BINS_PER_ROOT
-    light_grid(axes, "y")
+    style.light_grid(axes, "y")
     axes.bar(places[:-1], counts, width=0.92 * width, align="edge", color=colour, linewidth=0)
     left = -3.2 * width
-    lost = OUTCOME_COLOURS[_HAZARDS[index][0]]
+    lost = style.OUTCOME_COLOURS[_HAZARDS[index][0]]
     axes.bar(left, contacts, width=1.8 * width, align="edge", color=lost, linewidth=0)
     axes.annotate(
         f"{contacts} {_HAZARDS[index][0]}", (left, 1.0), xycoords=("data", "axes fraction"),
-        fontsize=7, color=lost if contacts else INK, ha="left", va="top", weight="bold" if contacts else None,
+        fontsize=7, color=lost if contacts else style.INK, ha="left", va="top",
+        weight="bold" if contacts else None,
     )  # fmt: skip
-    axes.axvline(0.0, ymax=0.84, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.axvline(0.0, ymax=0.84, color=style.INK, linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_xlim(left - 0.4 * width, places[-1])
     ticks = [tick for tick in _TICKS if tick <= edges[-1]]
     axes.set_xticks([float(np.sqrt(tick)) for tick in ticks], [f"{tick:g}" for tick in ticks])

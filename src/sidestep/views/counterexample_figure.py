@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from sidestep.loop import Trajectory
+from sidestep.views import style
 from sidestep.views.motion import relative
 from sidestep.views.outlines import pursuer_heights
 from sidestep.views.scene import (
@@ -27,22 +28,6 @@ from sidestep.views.scene import (
     draw_time_marks,
     mark_periods,
     set_limits,
-)
-from sidestep.views.style import (
-    BLUE,
-    EVADER,
-    INK,
-    OBSTACLE,
-    OUTCOME_COLOURS,
-    OUTCOME_WORDS,
-    PURSUER,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-    shield_words,
 )
 from sidestep.world import Scenario
 
@@ -62,8 +47,8 @@ def counterexample_figure(
     """
     first = max(0, trajectory.length - round(_SHOWN_SECONDS / float(scenario.control_period)))
     nearest = _nearest(trajectory)
-    with house_style():
-        figure = new_figure(WIDTH, 6.6)
+    with style.house_style():
+        figure = style.new_figure(style.WIDTH, 6.6)
         grid = figure.add_gridspec(3, 2, height_ratios=[1.9, 1.0, 0.8])
         scene, seen = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
         gaps, wheels = figure.add_subplot(grid[1, :]), figure.add_subplot(grid[2, :])
@@ -73,7 +58,7 @@ def counterexample_figure(
         _draw_wheels(wheels, scenario, trajectory, nearest, first)
         gaps.sharex(wheels)
         gaps.tick_params(axis="x", labelbottom=False)
-        panel_titles(
+        style.panel_titles(
             [scene, seen, gaps, wheels],
             [
                 "The last seconds" if first else "The whole episode",
@@ -83,11 +68,11 @@ def counterexample_figure(
             ],
         )
         duration = trajectory.length * float(scenario.control_period)
-        title = f"{shield_words(shield)}: " if shield else ""
-        title += f"{OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
+        title = f"{style.shield_words(shield)}: " if shield else ""
+        title += f"{style.OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
         title = title[:1].upper() + title[1:]
         figure.suptitle(f"{title}\n{words}" if words else title, x=0.01, ha="left", fontsize=8.5)
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def _nearest(trajectory: Trajectory) -> int:
@@ -123,15 +108,13 @@ def _draw_scene(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: i
     size = 0.06 * float(np.ptp(axes.get_xlim()))
     for index in range(poses.shape[1]):
         draw_capture_set(axes, scenario, poses[end, index])
-        axes.plot(*poses[first:, index, :2].T, color=PURSUER, linewidth=1.3, zorder=4)
+        axes.plot(*poses[first:, index, :2].T, color=style.PURSUER, linewidth=1.3, zorder=4)
         draw_pursuer(axes, poses[first, index], size=size, alpha=0.6)
         draw_pursuer(axes, poses[end, index], size=1.4 * size)
-        draw_time_marks(axes, poses[:, index, :2], marks, length, PURSUER, dots=False, side=-1.0)
-    draw_time_marks(axes, evader, marks, length, EVADER)
-    colour = OUTCOME_COLOURS.get(trajectory.outcome, INK)
-    axes.plot(
-        *evader[end], "X", color=colour, markersize=8, markeredgecolor="white", markeredgewidth=0.8, zorder=9
-    )
+        draw_time_marks(axes, poses[:, index, :2], marks, length, style.PURSUER, dots=False, side=-1.0)
+    draw_time_marks(axes, evader, marks, length, style.EVADER)
+    colour = style.OUTCOME_COLOURS.get(trajectory.outcome, style.INK)
+    axes.plot(*evader[end], "X", zorder=9, **style.mark(colour, 8))
 
 
 def _draw_seen(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer: int, first: int) -> None:
@@ -142,12 +125,12 @@ def _draw_seen(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer: 
     span = 2.2 * float(np.abs(outline).max())
     set_limits(axes, np.array([[-span, -span], [span, span]]) / 1.15, 0.0)
     axes.add_patch(
-        Circle((0.0, 0.0), float(scenario.capture_distance), facecolor=PURSUER, alpha=0.15, linewidth=0)
+        Circle((0.0, 0.0), float(scenario.capture_distance), facecolor=style.PURSUER, alpha=0.15, linewidth=0)
     )
     axes.plot(*outline.T, **CAPTURE_SET_LOOK, label=capture_set_words(scenario))
     draw_pursuer(axes, np.zeros(3), size=0.12 * span)
-    axes.plot(*z.T, color=EVADER, linewidth=1.1)
-    axes.plot(*z[-1], "X", color=INK, markersize=7, markeredgecolor="white", markeredgewidth=0.8, zorder=9)
+    axes.plot(*z.T, color=style.EVADER, linewidth=1.1)
+    axes.plot(*z[-1], "X", zorder=9, **style.mark(style.INK, 7))
     axes.set_xlabel("ahead, m")
     axes.set_ylabel("left, m")
     axes.legend(loc="lower right")
@@ -158,15 +141,15 @@ def _draw_gaps(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: in
     times = (np.arange(first, trajectory.length) + 1) * float(scenario.control_period)
     margin = _margins(scenario, trajectory)[first + 1 :]
     curves: list[tuple[Any, str, str]] = [
-        (trajectory.events.pursuer_clearance[first:], PURSUER, "to the capture distance"),
-        (margin, BLUE, "to the capture set K"),
+        (trajectory.events.pursuer_clearance[first:], style.PURSUER, "to the capture distance"),
+        (margin, style.BLUE, "to the capture set K"),
     ]
     if trajectory.worlds.obstacles.shape[1]:
-        curves.append((trajectory.events.obstacle_clearance[first:], OBSTACLE, "to an obstacle"))
-    light_grid(axes, "y")
+        curves.append((trajectory.events.obstacle_clearance[first:], style.OBSTACLE, "to an obstacle"))
+    style.light_grid(axes, "y")
     for values, colour, label in curves:
         axes.plot(times, np.asarray(values), color=colour, linewidth=1.3, label=label)
-    axes.axhline(0.0, color=INK, linewidth=1.0)
+    axes.axhline(0.0, color=style.INK, linewidth=1.0)
     # Straight within a fraction of a millimetre of 0, logarithmic beyond: both matter here.
     axes.set_yscale("symlog", linthresh=1e-4, linscale=0.6)
     ticks = [-0.1, -0.01, -0.001, -0.0001, 0.0, 0.0001, 0.001, 0.01, 0.1, 1.0]
@@ -191,12 +174,12 @@ def _draw_wheels(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer
     length = float(scenario.control_period)
     wheels = np.asarray(trajectory.wheel_speeds)[first:, pursuer]
     edges = np.arange(first, trajectory.length + 1) * length
-    light_grid(axes, "y")
-    for side, colour, dashes in ((0, PURSUER, "solid"), (1, INK, (0, (3, 1.5)))):
+    style.light_grid(axes, "y")
+    for side, colour, dashes in ((0, style.PURSUER, "solid"), (1, style.INK, (0, (3, 1.5)))):
         axes.stairs(wheels[:, side], edges, color=colour, linewidth=1.3, linestyle=dashes, baseline=None)
     handles = [
-        Line2D([], [], color=PURSUER, label="left"),
-        Line2D([], [], color=INK, linestyle=(0, (3, 1.5)), label="right"),
+        Line2D([], [], color=style.PURSUER, label="left"),
+        Line2D([], [], color=style.INK, linestyle=(0, (3, 1.5)), label="right"),
     ]
     limit = float(scenario.pursuer_speed)
     axes.set_ylim(-1.25 * limit, 1.25 * limit)

@@ -16,18 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from sidestep.safety import PURSUIT_SHIELDS
 from sidestep.trials import InterventionMap
-from sidestep.views.scene import CAPTURE_SET_LOOK, capture_set_outline, correction_colours, guarded
-from sidestep.views.style import (
-    COLUMN,
-    INK,
-    PURSUER,
-    WIDTH,
-    house_style,
-    new_figure,
-    panel_titles,
-    save,
-    shield_words,
-)
+from sidestep.views import scene, style
 from sidestep.world import Scenario
 from sidestep.world.capture_geometry import capture_set_distance
 
@@ -53,14 +42,14 @@ def intervention_figure(
     names = list(maps)
     columns = max(len(names), 1)
     # One or two panels at full width would be higher than a page.
-    side = float(np.clip((WIDTH - 1.2) / columns, _LEAST_SIDE, COLUMN - 1.2))
-    with house_style():
-        figure = new_figure(side * columns + 1.2, 2 * side + 0.75)
+    side = float(np.clip((style.WIDTH - 1.2) / columns, _LEAST_SIDE, style.COLUMN - 1.2))
+    with style.house_style():
+        figure = style.new_figure(side * columns + 1.2, 2 * side + 0.75)
         grid = figure.subplots(2, columns, sharex=True, sharey=True, squeeze=False)
         bars = (
             (_share_colours(), Normalize(0.0, 100.0), "periods corrected, %"),
             (
-                correction_colours(),
+                scene.correction_colours(),
                 Normalize(0.0, 2.0 * float(scenario.evader_speed)),
                 "mean correction, m/s",
             ),
@@ -88,9 +77,9 @@ def intervention_figure(
             grid[row, 0].set_ylabel("to its left, m")
         for axes in grid[1]:
             axes.set_xlabel("ahead of the pursuer, m")
-        words = [shield_words(name) for name in names] or [""]
-        panel_titles(list(grid[0]), [word[:1].upper() + word[1:] for word in words])
-        return save(figure, path)
+        words = [style.shield_words(name) for name in names] or [""]
+        style.panel_titles(list(grid[0]), [word[:1].upper() + word[1:] for word in words])
+        return style.save(figure, path)
 
 
 def _share_colours() -> Colormap:
@@ -100,7 +89,7 @@ def _share_colours() -> Colormap:
 
 
 def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -> None:
-    built_in, scenario = scenario.built_in, guarded(scenario)
+    built_in, scenario = scenario.built_in, scene.guarded(scenario)
     radius, usable = float(scenario.capture_distance), float(scenario.usable_angle)
     half_axle = float(scenario.pursuer_half_axle)
     line = np.linspace(-reach, reach, 161)
@@ -113,23 +102,25 @@ def _draw_sets(axes: Axes, scenario: Scenario, reach: float, *, pursuit: bool) -
     labels = axes.clabel(levels, _LEVELS[1:], fmt="%g", fontsize=5.5, inline_spacing=1)
     for label in labels:
         label.set_rotation(0)
-    axes.add_patch(Circle((0, 0), radius, facecolor="white", edgecolor=PURSUER, linewidth=0.8, zorder=4))
-    outline = capture_set_outline(scenario)
-    axes.plot(*outline.T, zorder=5, path_effects=_HALO, **CAPTURE_SET_LOOK)
+    axes.add_patch(
+        Circle((0, 0), radius, facecolor="white", edgecolor=style.PURSUER, linewidth=0.8, zorder=4)
+    )
+    outline = scene.capture_set_outline(scenario)
+    axes.plot(*outline.T, zorder=5, path_effects=_HALO, **scene.CAPTURE_SET_LOOK)
     for towards in (0.0, 180.0):
         degrees = np.rad2deg(usable)
         axes.add_patch(
-            Arc((0, 0), 2 * radius, 2 * radius, angle=towards, theta1=-degrees, theta2=degrees, color=PURSUER,
-                linewidth=2.2, zorder=6)
+            Arc((0, 0), 2 * radius, 2 * radius, angle=towards, theta1=-degrees, theta2=degrees,
+                color=style.PURSUER, linewidth=2.2, zorder=6)
         )  # fmt: skip
     for wheel in (-half_axle, half_axle) if built_in else ():
         place = (-0.3 * half_axle, wheel - 0.08 * half_axle)
         axes.add_patch(
-            Rectangle(place, 0.6 * half_axle, 0.16 * half_axle, facecolor=INK, linewidth=0, zorder=6)
+            Rectangle(place, 0.6 * half_axle, 0.16 * half_axle, facecolor=style.INK, linewidth=0, zorder=6)
         )
     size = 0.55 * radius
     shape = size * np.array([[0.75, 0.0], [-0.5, 0.5], [-0.25, 0.0], [-0.5, -0.5]])
-    axes.add_patch(Polygon(shape, facecolor=PURSUER, edgecolor="white", linewidth=0.5, zorder=7))
+    axes.add_patch(Polygon(shape, facecolor=style.PURSUER, edgecolor="white", linewidth=0.5, zorder=7))
     axes.set_aspect("equal")
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
@@ -156,6 +147,6 @@ def _draw_directions(axes: Axes, one: InterventionMap) -> None:
     x, y = np.meshgrid(middle, middle)
     axes.quiver(
         x[shown], y[shown], ahead[shown], left[shown], angles="xy", scale_units="xy", pivot="mid",
-        scale=float(np.max(size)) / (1.1 * step), color=INK, width=0.006, headwidth=4.5, headlength=4.5,
+        scale=float(np.max(size)) / (1.1 * step), color=style.INK, width=0.006, headwidth=4.5, headlength=4.5,
         headaxislength=4.0, zorder=3.5, path_effects=[withStroke(linewidth=1.2, foreground="white")],
     )  # fmt: skip

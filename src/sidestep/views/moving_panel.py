@@ -14,16 +14,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
+from sidestep.views import scene, style
 from sidestep.views.motion import Instant
 from sidestep.views.outlines import LevelOutlines
-from sidestep.views.scene import (
-    CAPTURE_SET_LOOK,
-    LEVEL_COLOUR,
-    capture_set_outline,
-    drawn_half_axle,
-    to_world,
-)
-from sidestep.views.style import EVADER, INK, OBSTACLE, OUTCOME_COLOURS, PURSUER, TARGET
 from sidestep.world import Scenario
 
 NOMINAL_DASHES = (0, (2.2, 1.2))
@@ -60,7 +53,7 @@ class _Arrow:
             pose = np.array([*(place + length * along), np.arctan2(along[1], along[0])])
             shaft = np.stack([place, place + max(length - 0.8 * self._head, 0.0) * along])
             self.shaft.set_data(*shaft.T)
-            self.head.set_xy(to_world(self._head * _HEAD, pose))
+            self.head.set_xy(scene.to_world(self._head * _HEAD, pose))
 
 
 @final
@@ -69,8 +62,8 @@ class _Pursuer:
     its capture set K."""
 
     def __init__(self, axes: Axes, scenario: Scenario, number: str):
-        axle = drawn_half_axle(scenario)
-        self._outline = capture_set_outline(scenario, 61)
+        axle = scene.drawn_half_axle(scenario)
+        self._outline = scene.capture_set_outline(scenario, 61)
         self._circle = float(scenario.capture_distance) * _CIRCLE
         # The axle is true; wheels and body are as large as fits it and the capture circle.
         room = min(axle, float(scenario.capture_distance))
@@ -90,15 +83,15 @@ class _Pursuer:
             (drawn,) = axes.plot(*shape.T, zorder=zorder, **look)
             self._parts.append((drawn, shape))
 
-        area(self._circle, 1.0, facecolor=PURSUER, alpha=0.12, linewidth=0)
-        line(self._circle, 2.0, color=PURSUER, linewidth=0.8)
-        line(self._outline, 3.0, **CAPTURE_SET_LOOK)
-        line(self._axle, 5.5, color=INK, linewidth=1.0)
+        area(self._circle, 1.0, facecolor=style.PURSUER, alpha=0.12, linewidth=0)
+        line(self._circle, 2.0, color=style.PURSUER, linewidth=0.8)
+        line(self._outline, 3.0, **scene.CAPTURE_SET_LOOK)
+        line(self._axle, 5.5, color=style.INK, linewidth=1.0)
         for wheel in self._wheels:
-            area(wheel, 5.6, facecolor=INK, edgecolor="white", linewidth=0.4)
-        area(self._body, 6.0, facecolor=PURSUER, edgecolor="white", linewidth=0.5)
+            area(wheel, 5.6, facecolor=style.INK, edgecolor="white", linewidth=0.4)
+        area(self._body, 6.0, facecolor=style.PURSUER, edgecolor="white", linewidth=0.5)
         self._number = axes.text(
-            0.0, 0.0, number, color=PURSUER, fontsize=7, fontweight="bold", ha="center", va="center",
+            0.0, 0.0, number, color=style.PURSUER, fontsize=7, fontweight="bold", ha="center", va="center",
             zorder=8.0, path_effects=_HALO, clip_on=True,
         )  # fmt: skip
 
@@ -110,7 +103,7 @@ class _Pursuer:
     def show(self, pose: np.ndarray) -> None:
         """Put everything where the pursuer is."""
         for part, shape in self._parts:
-            moved = to_world(shape, pose)
+            moved = scene.to_world(shape, pose)
             if isinstance(part, Line2D):
                 part.set_data(*moved.T)
             else:
@@ -140,22 +133,17 @@ class MovingPanel:
         self.axes, self._levels = axes, levels
         self._outlines = LevelOutlines(scenario, pursuit=pursuit)
         several = len(instant.poses) > 1
-        (self._low,) = axes.plot([], [], color=LEVEL_COLOUR, linewidth=0.5, zorder=0.5)
-        (self._zero,) = axes.plot([], [], color=INK, linewidth=1.0, zorder=2.5)
+        (self._low,) = axes.plot([], [], color=scene.LEVEL_COLOUR, linewidth=0.5, zorder=0.5)
+        (self._zero,) = axes.plot([], [], color=style.INK, linewidth=1.0, zorder=2.5)
         reach = float(scenario.reach_distance)
-        self._goal = Circle((0, 0), reach, facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2)
+        self._goal = Circle((0, 0), reach, facecolor=style.TARGET, alpha=0.25, linewidth=0, zorder=2)
         axes.add_patch(self._goal)
-        (self._star,) = axes.plot(
-            [], [], "*", color=TARGET, markersize=9, markeredgecolor="white", markeredgewidth=0.6, zorder=5
-        )
+        (self._star,) = axes.plot([], [], "*", zorder=5, **style.mark(style.TARGET, 9, width=0.6))
         collision = float(scenario.collision_distance)
         self._rocks: list[tuple[Circle, Circle, Line2D]] = []
         for _ in instant.obstacles:
-            area = Circle((0, 0), collision, facecolor=OBSTACLE, alpha=0.18, linewidth=0, zorder=1)
-            edge = Circle((0, 0), collision, fill=False, edgecolor=OBSTACLE, linewidth=0.8, zorder=2)
-            (dot,) = axes.plot([], [], "o", color=OBSTACLE, markersize=4, zorder=5)
-            axes.add_patch(area)
-            axes.add_patch(edge)
+            area, edge = style.draw_disc(axes, (0, 0), collision, style.OBSTACLE, alpha=0.18)
+            (dot,) = axes.plot([], [], "o", color=style.OBSTACLE, markersize=4, zorder=5)
             self._rocks.append((area, edge, dot))
         self._pursuers = [
             _Pursuer(axes, scenario, str(number + 1) if several else "")
@@ -164,19 +152,17 @@ class MovingPanel:
         self._faint, *self._trails = (
             axes.plot([], [], linewidth=1.2, zorder=4, solid_joinstyle="round")[0] for _ in range(trails + 2)
         )
-        self._faint.set(color=EVADER, alpha=0.3, linewidth=0.8)
+        self._faint.set(color=style.EVADER, alpha=0.3, linewidth=0.8)
         self._corrected = LineCollection([], linewidth=4.0, capstyle="round", zorder=3.9)
         axes.add_collection(self._corrected, autolim=False)
         speed = float(scenario.evader_speed)
-        self._nominal = _Arrow(axes, speed, INK, dashes=NOMINAL_DASHES, zorder=6.6)
-        self._action = _Arrow(axes, speed, EVADER, zorder=6.7)
-        (self._evader,) = axes.plot(
-            [], [], "o", color=EVADER, markersize=6.5, markeredgecolor="white", markeredgewidth=0.9, zorder=7
-        )
+        self._nominal = _Arrow(axes, speed, style.INK, dashes=NOMINAL_DASHES, zorder=6.6)
+        self._action = _Arrow(axes, speed, style.EVADER, zorder=6.7)
+        (self._evader,) = axes.plot([], [], "o", zorder=7, **style.mark(style.EVADER, 6.5, width=0.9))
         (self._lost,) = axes.plot([], [], "X", markersize=10, markeredgecolor="white", zorder=9)
-        (self._beyond,) = axes.plot([], [], color=EVADER, markersize=7, linestyle="none", zorder=9)
+        (self._beyond,) = axes.plot([], [], color=style.EVADER, markersize=7, linestyle="none", zorder=9)
         self._distance = axes.text(
-            0, 0, "", fontsize=7, color=EVADER, ha="center", va="center", path_effects=_HALO, zorder=9
+            0, 0, "", fontsize=7, color=style.EVADER, ha="center", va="center", path_effects=_HALO, zorder=9
         )
         self.artists: list[Artist] = sorted(self._all(), key=lambda artist: artist.get_zorder())
         for artist in self.artists:
@@ -203,9 +189,9 @@ class MovingPanel:
         """Draw ways: the evader's, an older part of it faintly, those of others with their colours, and the
         pieces of the evader's on which the shield stepped in, with the colours of the corrections."""
         self._faint.set_data(*faint.T)
-        for line, (way, colour) in zip(self._trails, [(evader, EVADER), *others], strict=True):
+        for line, (way, colour) in zip(self._trails, [(evader, style.EVADER), *others], strict=True):
             line.set_data(*way.T)
-            line.set(color=colour, linewidth=1.0 if colour == OBSTACLE else 1.3)
+            line.set(color=colour, linewidth=1.0 if colour == style.OBSTACLE else 1.3)
         self._corrected.set_segments(list(corrected))
         self._corrected.set_color(list(map(tuple, colours)))
 
@@ -228,7 +214,7 @@ class MovingPanel:
         for arrow, velocity in ((self._nominal, now.nominal), (self._action, now.action)):
             arrow.show(now.evader, np.zeros(2) if lost else velocity)
         self._lost.set_data(*(now.evader[:, None] if lost else np.zeros((2, 0))))
-        self._lost.set_color(OUTCOME_COLOURS.get(outcome or "", INK))
+        self._lost.set_color(style.OUTCOME_COLOURS.get(outcome or "", style.INK))
         self._lost.set_markeredgecolor("white")
         self._show_beyond(now.evader)
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
+from sidestep.views import scene
 from sidestep.views.motion import relative
-from sidestep.views.scene import LEVEL_COLOUR, LEVELS, capture_set_outline, guarded, to_world
 from sidestep.views.style import INK
 from sidestep.world import Scenario, World
 
@@ -30,7 +30,7 @@ def pursuer_heights(
     The game's is the signed distance from the capture set K, which is |x| cos S + |y| sin S - l in front of
     the pursuer and behind it, and |z| - l aside.
     """
-    scenario = guarded(scenario)
+    scenario = scene.guarded(scenario)
     usable = float(scenario.usable_angle) if pursuit else None
     return _heights(points, pose, float(scenario.capture_distance), usable)
 
@@ -53,20 +53,20 @@ class LevelOutlines:
     """
 
     def __init__(self, scenario: Scenario, *, pursuit: bool):
-        scenario = guarded(scenario)
+        scenario = scene.guarded(scenario)
         self._usable = float(scenario.usable_angle) if pursuit else None
         self._capture, self._collision = float(scenario.capture_distance), float(scenario.collision_distance)
         angles = np.linspace(0.0, 2.0 * np.pi, _POINTS)
         self._circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         self._shape = self._circle
         if pursuit:
-            self._shape = _dense(capture_set_outline(scenario, _POINTS)) / self._capture
+            self._shape = _dense(scene.capture_set_outline(scenario, _POINTS)) / self._capture
 
     def at(
         self, poses: Float[np.ndarray, "m 3"], obstacles: Float[np.ndarray, "k 2"], level: float
     ) -> Float[np.ndarray, "n 2"]:
         """The level (m) around pursuers and obstacles: closed, NaN between them and where they are cut."""
-        outlines = [to_world((self._capture + level) * self._shape, pose) for pose in poses]
+        outlines = [scene.to_world((self._capture + level) * self._shape, pose) for pose in poses]
         outlines += [centre + (self._collision + level) * self._circle for centre in obstacles]
         for one, outline in enumerate(outlines):
             outside = np.ones(len(outline), bool)
@@ -82,13 +82,15 @@ class LevelOutlines:
 
 
 def draw_barrier_levels(
-    axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = LEVELS
+    axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = scene.LEVELS
 ) -> None:
     """Level sets of the composed barrier h = min_i h_i over evader positions, all others held in place."""
     outlines = LevelOutlines(scenario, pursuit=pursuit)
     poses, obstacles = np.asarray(world.pursuers), np.asarray(world.obstacles)[:, :2]
     for level in levels:
-        axes.plot(*outlines.at(poses, obstacles, level).T, color=LEVEL_COLOUR, linewidth=0.6, zorder=0.5)
+        axes.plot(
+            *outlines.at(poses, obstacles, level).T, color=scene.LEVEL_COLOUR, linewidth=0.6, zorder=0.5
+        )
     axes.plot(*outlines.at(poses, obstacles, 0.0).T, color=INK, linewidth=1.0, zorder=2.5)
 
 

@@ -15,6 +15,7 @@ import sidestep
 from sidestep.pursuit import CaptureGame
 from sidestep.store.files import write_bytes
 from sidestep.store.runs import held_if_run
+from sidestep.views import style
 from sidestep.views.html import shown_number, shown_value
 from sidestep.views.pooling import pooled_evaluation
 from sidestep.views.report_sections import (
@@ -29,7 +30,6 @@ from sidestep.views.report_sections import (
 from sidestep.views.report_tables import card, comparison, percent
 from sidestep.views.runs import Run, by_shield, load_run
 from sidestep.views.scene import guarded
-from sidestep.views.style import COLUMN, OUTCOME_WORDS, shield_colour, shield_words
 from sidestep.views.training_figures import (
     PAPER_CONVERGED,
     outcome_figure,
@@ -88,7 +88,7 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
     untrained_scenes = {shield: scene for shield, (_, scene) in first_of(groups, "untrained_scene").items()}
     scenes = first_of(groups, "scene")
     return {
-        "title": f"{scenario.name} scenario: " + ", ".join(shield_words(shield) for shield in groups),
+        "title": f"{scenario.name} scenario: " + ", ".join(style.shield_words(shield) for shield in groups),
         "version": first.config.get("version", sidestep.__version__),
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "python": platform.python_version(),
@@ -121,9 +121,9 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "game": _game_numbers(scenario),
         "joint": "joint" in groups,
         "configurations": [_configuration(run) for run in runs],
-        "outcome_words": OUTCOME_WORDS,
-        "shield_words": shield_words,
-        "colour": shield_colour,
+        "outcome_words": style.OUTCOME_WORDS,
+        "shield_words": style.shield_words,
+        "colour": style.shield_colour,
         "percent": percent,
         "number": shown_number,
         "paper_converged": PAPER_CONVERGED,
@@ -139,7 +139,7 @@ def _pooled_evaluations(groups: Mapping[str, Sequence[Run]], field: str) -> dict
 
 def _reward(runs: Sequence[Run], folder: Path) -> str:
     """The page's reward figure; beside it, the same for one column of a paper."""
-    reward_figure(runs, folder / "reward-column", width=COLUMN)
+    reward_figure(runs, folder / "reward-column", width=style.COLUMN)
     return embedded(reward_figure(runs, folder / "reward"))
 
 
@@ -178,7 +178,7 @@ def _game_numbers(scenario: Scenario) -> dict[str, Any]:
 
 def _configuration(run: Run) -> dict[str, Any]:
     return {
-        "name": f"{shield_words(run.shield)}, seed {run.seed}",
+        "name": f"{style.shield_words(run.shield)}, seed {run.seed}",
         "run": {
             key: shown_value(run.config.get(key))
             for key in ("shield", "pursuer", "seed", "episodes", "version")

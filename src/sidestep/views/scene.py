@@ -19,15 +19,15 @@ from matplotlib.patheffects import withStroke
 
 from sidestep.loop import Trajectory
 from sidestep.safety import covered, of_control_point
+from sidestep.views import style
 from sidestep.views.labels import Label
-from sidestep.views.style import EVADER, FAINT, OBSTACLE, PURSUER, TARGET
 from sidestep.world import Scenario, World
 
 _MOST_MARKS = 8
 _LABEL_HALO = [withStroke(linewidth=1.8, foreground="white")]
-_RANKS = {EVADER: 0, PURSUER: 1}
+_RANKS = {style.EVADER: 0, style.PURSUER: 1}
 """Whose time labels go first where there is little room."""
-CAPTURE_SET_LOOK: dict[str, Any] = {"color": PURSUER, "linewidth": 1.4, "linestyle": (0, (2.5, 2))}
+CAPTURE_SET_LOOK: dict[str, Any] = {"color": style.PURSUER, "linewidth": 1.4, "linestyle": (0, (2.5, 2))}
 """How the outline of the capture set K is drawn in every view."""
 LEVELS = (0.1, 0.2, 0.3)
 """Levels of the barrier (m) that are drawn beside its level 0."""
@@ -128,33 +128,19 @@ def draw_pursuer(
     shape = size * np.array([[0.75, 0.0], [-0.5, 0.5], [-0.25, 0.0], [-0.5, -0.5]])
     axes.add_patch(
         Polygon(
-            to_world(shape, pose), facecolor=PURSUER, edgecolor="white", linewidth=0.5, alpha=alpha, zorder=6
+            to_world(shape, pose),
+            facecolor=style.PURSUER,
+            edgecolor="white",
+            linewidth=0.5,
+            alpha=alpha,
+            zorder=6,
         )
     )
 
 
 def draw_capture_set(axes: Axes, scenario: Scenario, pose: Float[np.ndarray, "3"]) -> None:
     """The capture circle and the capture set K around a pursuer."""
-    axes.add_patch(
-        Circle(
-            _at(pose[:2]),
-            float(scenario.capture_distance),
-            facecolor=PURSUER,
-            alpha=0.12,
-            linewidth=0,
-            zorder=1,
-        )
-    )
-    axes.add_patch(
-        Circle(
-            _at(pose[:2]),
-            float(scenario.capture_distance),
-            fill=False,
-            edgecolor=PURSUER,
-            linewidth=0.8,
-            zorder=2,
-        )
-    )
+    style.draw_disc(axes, _at(pose[:2]), float(scenario.capture_distance), style.PURSUER, alpha=0.12)
     outline = to_world(capture_set_outline(scenario), pose)
     # Over the level h = 0, which has the same place around a pursuer for the shields that keep K.
     axes.plot(*outline.T, **CAPTURE_SET_LOOK, zorder=3)
@@ -167,37 +153,25 @@ def draw_obstacles(
     radius, length = float(scenario.collision_distance), float(scenario.control_period)
     path = np.asarray(trajectory.worlds.obstacles)
     for index in range(path.shape[1]):
-        axes.plot(*path[:, index, :2].T, color=OBSTACLE, linewidth=1.0, zorder=2)
+        axes.plot(*path[:, index, :2].T, color=style.OBSTACLE, linewidth=1.0, zorder=2)
         for mark in (0, *marks):
             axes.add_patch(
                 Circle(
-                    _at(path[mark, index]), radius, fill=False, edgecolor=FAINT, linewidth=0.7, linestyle=":",
-                    zorder=1,
+                    _at(path[mark, index]), radius, fill=False, edgecolor=style.FAINT, linewidth=0.7,
+                    linestyle=":", zorder=1,
                 )
             )  # fmt: skip
-        draw_time_marks(axes, path[:, index, :2], marks, length, OBSTACLE)
+        draw_time_marks(axes, path[:, index, :2], marks, length, style.OBSTACLE)
         centre = _at(path[period, index])
-        axes.add_patch(Circle(centre, radius, facecolor=OBSTACLE, alpha=0.18, linewidth=0, zorder=1))
-        axes.add_patch(Circle(centre, radius, fill=False, edgecolor=OBSTACLE, linewidth=0.8, zorder=2))
-        axes.plot(*centre, "o", color=OBSTACLE, markersize=4, zorder=8.5)
+        style.draw_disc(axes, centre, radius, style.OBSTACLE, alpha=0.18)
+        axes.plot(*centre, "o", color=style.OBSTACLE, markersize=4, zorder=8.5)
 
 
 def draw_target(axes: Axes, scenario: Scenario, target: Float[np.ndarray, "2"]) -> None:
     """The target and the distance that counts as reached."""
-    axes.add_patch(
-        Circle(
-            _at(target), float(scenario.reach_distance), facecolor=TARGET, alpha=0.25, linewidth=0, zorder=2
-        )
-    )
-    axes.plot(
-        *target,
-        marker="*",
-        color=TARGET,
-        markersize=9,
-        markeredgecolor="white",
-        markeredgewidth=0.6,
-        zorder=7,
-    )
+    reach = float(scenario.reach_distance)
+    axes.add_patch(Circle(_at(target), reach, facecolor=style.TARGET, alpha=0.25, linewidth=0, zorder=2))
+    axes.plot(*target, "*", zorder=7, **style.mark(style.TARGET, 9, width=0.6))
 
 
 def draw_time_marks(
@@ -223,15 +197,7 @@ def draw_time_marks(
         if mark >= len(path):
             continue
         if dots:
-            axes.plot(
-                *path[mark],
-                "o",
-                color="white",
-                markeredgecolor=colour,
-                markersize=3.2,
-                markeredgewidth=0.9,
-                zorder=8,
-            )
+            axes.plot(*path[mark], "o", zorder=8, **style.mark("white", 3.2, colour, 0.9))
         # Where a robot stands still its labels would pile up.
         if last is not None and np.hypot(*(path[mark] - last)) < room:
             continue
@@ -255,7 +221,7 @@ def draw_evader_path(axes: Axes, trajectory: Trajectory, norm: Normalize) -> Lin
     path = np.asarray(trajectory.worlds.evader)
     correction = np.asarray(trajectory.intervention)
     segments = np.stack([path[:-1], path[1:]], axis=1)
-    axes.plot(*path.T, color=EVADER, linewidth=1.1, zorder=4)
+    axes.plot(*path.T, color=style.EVADER, linewidth=1.1, zorder=4)
     stepped_in = correction > 1e-6
     lines = LineCollection(
         list(segments[stepped_in]), array=correction[stepped_in], cmap=correction_colours(), norm=norm,

@@ -18,29 +18,9 @@ from PIL import Image
 
 from sidestep.loop import Trajectory
 from sidestep.safety import PURSUIT_SHIELDS
+from sidestep.views import scene, style
 from sidestep.views.motion import Instant, Motion
 from sidestep.views.moving_panel import NOMINAL_DASHES, MovingPanel
-from sidestep.views.scene import (
-    CAPTURE_SET_LOOK,
-    LEVEL_COLOUR,
-    LEVELS,
-    capture_set_outline,
-    capture_set_words,
-    correction_colours,
-)
-from sidestep.views.style import (
-    EVADER,
-    FAINT,
-    INK,
-    OBSTACLE,
-    OUTCOME_COLOURS,
-    OUTCOME_WORDS,
-    PURSUER,
-    TARGET,
-    house_style,
-    light_grid,
-    shield_words,
-)
 from sidestep.views.trajectory_figures import (
     ANSWERS,
     correction_norm,
@@ -82,7 +62,7 @@ class Stage:
         title: str | None = None,
         speed: float = 1.0,
         width: int = 1280,
-        levels: Sequence[float] = LEVELS,
+        levels: Sequence[float] = scene.LEVELS,
     ):
         if trajectory.length < 1:
             raise VideoError("the episode has no control period to show")
@@ -90,10 +70,10 @@ class Stage:
         self._trajectory, self._status = trajectory, np.asarray(trajectory.status)
         self._ways = Ways(scenario, trajectory, self.motion)
         self._speed = "" if speed == 1.0 else f" (× {speed:g})"
-        words = title if title is not None else shield_words(shield) if shield else ""
+        words = title if title is not None else style.shield_words(shield) if shield else ""
         self._words = words[:1].upper() + words[1:]
         start = self.motion.at(0.0)
-        with house_style():
+        with style.house_style():
             # An MP4 needs even numbers of pixels.
             pixels = 2 * np.ceil(np.array(_INCHES) * width / _INCHES[0] / 2.0)
             dpi = width / _INCHES[0]
@@ -147,21 +127,23 @@ class Stage:
 
     def _draw_key(self, scenario: Scenario, obstacles: bool, levels: Sequence[float]) -> None:
         handles: list[Any] = [
-            Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
-            Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
-            Line2D([], [], color=TARGET, marker="*", linestyle="none", markersize=7, label="target"),
-            Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
-            Line2D([], [], **CAPTURE_SET_LOOK, label=capture_set_words(scenario)),
-            Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
-            Line2D([], [], color=EVADER, linewidth=1.5, label="velocity driven"),
-            Line2D([], [], color=INK, linewidth=1.5, linestyle=NOMINAL_DASHES, label="nominal velocity"),
-            Patch(facecolor=correction_colours()(0.6), label="shield corrects"),
+            Line2D([], [], color=style.EVADER, marker="o", markersize=4, label="evader"),
+            Line2D([], [], color=style.PURSUER, marker=">", markersize=4, label="pursuer"),
+            Line2D([], [], color=style.TARGET, marker="*", linestyle="none", markersize=7, label="target"),
+            Patch(facecolor=style.PURSUER, alpha=0.25, label="capture distance"),
+            Line2D([], [], **scene.CAPTURE_SET_LOOK, label=scene.capture_set_words(scenario)),
+            Line2D([], [], color=style.INK, linewidth=1.0, label="h = 0"),
+            Line2D([], [], color=style.EVADER, linewidth=1.5, label="velocity driven"),
+            Line2D(
+                [], [], color=style.INK, linewidth=1.5, linestyle=NOMINAL_DASHES, label="nominal velocity"
+            ),
+            Patch(facecolor=scene.correction_colours()(0.6), label="shield corrects"),
         ]
         if levels:
             told = f"h = {', '.join(f'{level:g}' for level in levels)} m"
-            handles.insert(6, Line2D([], [], color=LEVEL_COLOUR, linewidth=0.6, label=told))
+            handles.insert(6, Line2D([], [], color=scene.LEVEL_COLOUR, linewidth=0.6, label=told))
         if obstacles:
-            handles.insert(4, Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
+            handles.insert(4, Patch(facecolor=style.OBSTACLE, alpha=0.35, label="collision distance"))
         self._figure.legend(
             handles=handles, loc="center", bbox_to_anchor=(0.5, 1.56 / _INCHES[1]), ncols=6, fontsize=6.3,
             columnspacing=1.6, handletextpad=0.5, labelspacing=0.35, borderpad=0.0,
@@ -210,12 +192,12 @@ class Stage:
         self._clock.set_text(f"{now.time:.2f} s{self._speed}")
         colour, words = ANSWERS[int(self._status[now.period])]
         self._answer.set_text(f"shield: {words}")
-        self._answer.set_color(INK if words == "unchanged" else colour)
-        told, colour = self._words, INK
+        self._answer.set_color(style.INK if words == "unchanged" else colour)
+        told, colour = self._words, style.INK
         if end:
             outcome = self._trajectory.outcome
-            colour = OUTCOME_COLOURS.get(outcome, INK)
-            told = f"{OUTCOME_WORDS[outcome]} after {self.motion.duration:.2f} s"
+            colour = style.OUTCOME_COLOURS.get(outcome, style.INK)
+            told = f"{style.OUTCOME_WORDS[outcome]} after {self.motion.duration:.2f} s"
             told = f"{self._words}: {told}" if self._words else told[:1].upper() + told[1:]
         self._heading.set_text(told)
         self._heading.set_color(colour)
@@ -239,13 +221,19 @@ def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
     if np.all(np.abs(middle) + half > side / 2):
         axes.add_patch(
             Rectangle(
-                (-side / 2, -side / 2), side, side, fill=False, edgecolor=FAINT, linewidth=0.9, zorder=0.4
+                (-side / 2, -side / 2),
+                side,
+                side,
+                fill=False,
+                edgecolor=style.FAINT,
+                linewidth=0.9,
+                zorder=0.4,
             )
         )
 
 
 def _set_up_seen(axes: Axes, scenario: Scenario, distances: Float[np.ndarray, "n"]) -> None:
-    reach = float(np.abs(capture_set_outline(scenario)).max())
+    reach = float(np.abs(scene.capture_set_outline(scenario)).max())
     half = float(np.clip(1.1 * distances.max(), 2.0 * reach, _WIDEST * reach))
     axes.set_xlim(-half, half)
     axes.set_ylim(-half, half)
@@ -256,7 +244,7 @@ def _round_ticks(axes: Axes, across: int, up: int) -> None:
     """Few digits, for which there is room at the left."""
     for axis, most in ((axes.xaxis, across), (axes.yaxis, up)):
         axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
-    light_grid(axes)
+    style.light_grid(axes)
 
 
 def _draw_strips(
@@ -274,7 +262,9 @@ def _draw_strips(
             Rectangle((0.0, 0.0), duration, 1.0, transform=strip.get_xaxis_transform(), facecolor="white",
                       alpha=0.72, linewidth=0, zorder=5)
         )  # fmt: skip
-        (line,) = strip.plot([0, 0], [0, 1], transform=strip.get_xaxis_transform(), color=INK, linewidth=1.0)
+        (line,) = strip.plot(
+            [0, 0], [0, 1], transform=strip.get_xaxis_transform(), color=style.INK, linewidth=1.0
+        )
         veils.append((strip, (veil, line)))
     barriers.tick_params(labelbottom=False)
     # Fewer than in a figure: the strip is low. On the scale of square roots they must lie apart.

@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from sidestep.store.files import write_bytes
 from sidestep.views.labels import place_labels
@@ -105,6 +106,22 @@ def shield_dashes(name: str) -> Any:
 def shield_words(name: str) -> str:
     """How captions call a shield."""
     return _SHIELD_WORDS.get(name, f"{name} shield")
+
+
+def mark(colour: str, size: float | int, edge: str = "white", width: float = 0.8) -> dict[str, Any]:
+    """The look of a single mark with an edge, for `Axes.plot` and `Line2D`; size and width in points."""
+    return {"color": colour, "ms": size, "mec": edge, "mew": width, "ls": "none"}
+
+
+def draw_disc(
+    axes: Axes, centre: tuple[float, float], radius: float, colour: str, *, alpha: float
+) -> tuple[Circle, Circle]:
+    """A tinted disc with a hairline edge, below everything else; **returns** disc and edge."""
+    area = Circle(centre, radius, facecolor=colour, alpha=alpha, linewidth=0, zorder=1)
+    edge = Circle(centre, radius, fill=False, edgecolor=colour, linewidth=0.8, zorder=2)
+    axes.add_patch(area)
+    axes.add_patch(edge)
+    return area, edge
 
 
 @contextmanager

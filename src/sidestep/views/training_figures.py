@@ -18,22 +18,8 @@ from sidestep.store.runs import (
     stays_converged_from,
 )
 from sidestep.trials import interquartile_mean, wilson_interval
+from sidestep.views import style
 from sidestep.views.runs import Run, by_shield
-from sidestep.views.style import (
-    INK,
-    OUTCOME_COLOURS,
-    OUTCOME_MARKERS,
-    OUTCOME_WORDS,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-    shield_colour,
-    shield_dashes,
-    shield_words,
-)
 
 PAPER_CONVERGED = 80
 PAPER_EPISODES = 200
@@ -44,7 +30,7 @@ _BAND, _HIGHEST = 0.32, 1000.0
 """Half the height of a run's band of returns, in rows, and the return at its top."""
 
 
-def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = WIDTH) -> tuple[Path, Path]:
+def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = style.WIDTH) -> tuple[Path, Path]:
     """Returns over training episodes: above as means, below one by one, with how every episode ended.
 
     a: mean return of the last 20 episodes; over several seeds the interquartile mean of it (thick) with each
@@ -54,22 +40,22 @@ def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = WIDTH
     """
     groups = by_shield(runs)
     rows = [run for group in groups.values() for run in group]
-    with house_style():
+    with style.house_style():
         raster_height = _row_height(rows) * max(len(rows), 1) + 0.25
         # In a column there is room for the letters of the panels alone.
-        narrow = width < WIDTH
-        figure = new_figure(width, (2.5 if narrow else 2.9) + raster_height)
+        narrow = width < style.WIDTH
+        figure = style.new_figure(width, (2.5 if narrow else 2.9) + raster_height)
         top, raster = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, raster_height])
         for position, (shield, group) in enumerate(groups.items()):
-            colour, words = shield_colour(shield, position), shield_words(shield)
-            _draw_returns(top, group, colour, words, shield_dashes(shield))
+            colour, words = style.shield_colour(shield, position), style.shield_words(shield)
+            _draw_returns(top, group, colour, words, style.shield_dashes(shield))
         titles = [f"Mean return of the last {CONVERGENCE_WINDOW} episodes", "Return of each episode"]
-        panel_titles([top, raster], ["", ""] if narrow else titles, in_caption=True)
+        style.panel_titles([top, raster], ["", ""] if narrow else titles, in_caption=True)
         _finish_returns(top, rows, narrow=narrow)
         _draw_episodes(raster, rows, narrow=narrow)
         if narrow:
             raster.set_title(raster.get_title("left"), x=_BESIDE)
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def _row_height(runs: Sequence[Run]) -> float:
@@ -114,14 +100,14 @@ def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, das
 
 def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
     longest = max((len(run.metrics) for run in runs), default=1)
-    light_grid(axes, "y")
-    axes.axhline(CONVERGENCE_RETURN, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    style.light_grid(axes, "y")
+    axes.axhline(CONVERGENCE_RETURN, color=style.INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.text(
         1.005, CONVERGENCE_RETURN, f"{CONVERGENCE_RETURN:.0f}", transform=axes.get_yaxis_transform(),
         va="center", fontsize=7,
     )  # fmt: skip
     if longest > PAPER_CONVERGED:
-        axes.axvline(PAPER_CONVERGED, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+        axes.axvline(PAPER_CONVERGED, color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
         axes.text(
             PAPER_CONVERGED,
             0.03,
@@ -136,11 +122,11 @@ def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
     axes.set_ylim(min(low, 0.0) - (90.0 if longest > PAPER_CONVERGED else 0.0), max(high, 1050.0))
     axes.set_xlim(0, longest + 1)
     handles, _ = axes.get_legend_handles_labels()
-    look: dict[str, Any] = {"marker": "D", "linestyle": "none", "markeredgecolor": INK, "markersize": 4.5}
+    look: dict[str, Any] = {"marker": "D", "ls": "none", "mec": style.INK, "markersize": 4.5}
     words = ("first 940", "stays") if narrow else (f"first at {CONVERGENCE_RETURN:.0f}", "stays from here")
     diamonds = [
         Line2D([], [], **look, color=face, label=word)
-        for face, word in zip((INK, "white"), words, strict=True)
+        for face, word in zip((style.INK, "white"), words, strict=True)
     ]
     # Above the axes, where no curve can run.
     most = 2 if narrow else 3
@@ -162,11 +148,11 @@ def _draw_episodes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
         outcomes = np.array([episode["outcome"] for episode in run.metrics], dtype=object)
         for level in (_BAND, -_BAND):
             axes.axhline(row + level, color="#E6E6E6", linewidth=0.6, zorder=0.5)
-        for outcome, colour in OUTCOME_COLOURS.items():
+        for outcome, colour in style.OUTCOME_COLOURS.items():
             found = np.flatnonzero(outcomes == outcome)
             size = {"reached": 3.0, "timed_out": 9.0}.get(outcome, 13.0) * (0.6 if many else 1.0)
             axes.scatter(
-                found + 1, places[found], s=size, marker=OUTCOME_MARKERS[outcome], color=colour,
+                found + 1, places[found], s=size, marker=style.OUTCOME_MARKERS[outcome], color=colour,
                 linewidth=0, zorder=3 if outcome != "reached" else 2,
             )  # fmt: skip
     several_seeds = len(runs) > len({run.shield for run in runs})
@@ -184,10 +170,10 @@ def _draw_episodes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
     axes.set_xlabel("training episode")
     handles = [
         Line2D(
-            [], [], marker=OUTCOME_MARKERS[name], linestyle="none", color=colour, markeredgewidth=0,
-            markersize=5, label=name.replace("_", " ") if narrow else OUTCOME_WORDS[name],
+            [], [], marker=style.OUTCOME_MARKERS[name], linestyle="none", color=colour, markeredgewidth=0,
+            markersize=5, label=name.replace("_", " ") if narrow else style.OUTCOME_WORDS[name],
         )
-        for name, colour in OUTCOME_COLOURS.items()
+        for name, colour in style.OUTCOME_COLOURS.items()
     ]  # fmt: skip
     axes.legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2,
@@ -221,7 +207,7 @@ def safety_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
         low, high = wilson_interval(safe, len(outcomes))
         rows.append(
             {
-                "name": shield_words(shield),
+                "name": style.shield_words(shield),
                 "shield": shield,
                 "episodes": len(outcomes),
                 "safe": safe,
@@ -250,9 +236,9 @@ def safety_table(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         ("safety ratio", [share(column["ratio"]) for column in columns]),
         ("   95 % bounds", [f"{share(column['low'])[:-2]} – {share(column['high'])}" for column in columns]),
     ]
-    with house_style():
+    with style.house_style():
         height = 0.24
-        figure = new_figure(min(WIDTH, 1.6 + 1.35 * len(columns)), height * (len(lines) + 2.2))
+        figure = style.new_figure(min(style.WIDTH, 1.6 + 1.35 * len(columns)), height * (len(lines) + 2.2))
         axes = figure.add_subplot()
         axes.set_axis_off()
         axes.set_xlim(0, 1.2 + len(columns))
@@ -260,13 +246,13 @@ def safety_table(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         for index, column in enumerate(columns):
             axes.text(2.1 + index, -0.35, column["name"], ha="right", va="center", weight="bold")
         for row, (name, cells) in enumerate(lines):
-            quiet = "#555555" if name.startswith(" ") else INK
+            quiet = "#555555" if name.startswith(" ") else style.INK
             axes.text(0.02, row + 0.5, name, va="center", color=quiet)
             for index, cell in enumerate(cells):
                 axes.text(2.1 + index, row + 0.5, cell, ha="right", va="center", color=quiet)
         for y, width in ((-0.85, 1.2), (0.0, 0.6), (len(lines) + 0.1, 1.2)):
-            axes.plot([0, 1.2 + len(columns)], [y, y], color=INK, linewidth=width, clip_on=False)
-        return save(figure, path)
+            axes.plot([0, 1.2 + len(columns)], [y, y], color=style.INK, linewidth=width, clip_on=False)
+        return style.save(figure, path)
 
 
 def outcome_figure(
@@ -290,13 +276,13 @@ def outcome_figure(
     untrained = untrained or {}
     names = list(dict.fromkeys([*evaluations, *untrained]))
     apart = 0.21 if untrained else 0.0
-    with house_style():
-        figure = new_figure(WIDTH, 0.95 + (0.46 if untrained else 0.27) * len(names))
+    with style.house_style():
+        figure = style.new_figure(style.WIDTH, 0.95 + (0.46 if untrained else 0.27) * len(names))
         axes = figure.subplots(1, len(panels), sharey=True)
         for one, (outcome, title) in zip(axes, panels, strict=True):
             most = 1.0
             for row, name in enumerate(names):
-                colour = shield_colour(name, row)
+                colour = style.shield_colour(name, row)
                 for reports, place, face in (
                     (evaluations, row - apart, colour),
                     (untrained, row + apart, "white"),
@@ -307,21 +293,19 @@ def outcome_figure(
             one.set_xlim(-0.04 * most, 1.08 * most) if outcome != "reached" else None
             one.set_xlabel("% of episodes")
             one.set_title(title)
-            light_grid(one, "x")
+            style.light_grid(one, "x")
             one.tick_params(axis="y", length=0)
             one.spines["left"].set_visible(False)
-        axes[0].set_yticks(range(len(names)), [shield_words(name) for name in names])
+        axes[0].set_yticks(range(len(names)), [style.shield_words(name) for name in names])
         axes[0].set_ylim(len(names) - 0.5, -0.65)
         if untrained:
+            dot: dict[str, Any] = {"marker": "o", "linestyle": "none", "color": style.INK, "markersize": 5}
             handles = [
-                Line2D([], [], marker="o", linestyle="none", color=INK, markersize=5, label="learned policy"),
-                Line2D(
-                    [], [], marker="o", linestyle="none", color=INK, markerfacecolor="white", markersize=5,
-                    label="straight for the target, not learned",
-                ),
-            ]  # fmt: skip
+                Line2D([], [], label="learned policy", **dot),
+                Line2D([], [], label="straight for the target, not learned", markerfacecolor="white", **dot),
+            ]
             figure.legend(handles=handles, loc="outside lower center", ncols=2)
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def _draw_share(

@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 
 from sidestep.loop import Trajectory
 from sidestep.safety import PURSUIT_SHIELDS, Status
+from sidestep.views import style
 from sidestep.views.outlines import LevelOutlines, draw_barrier_levels
 from sidestep.views.scene import (
     CAPTURE_SET_LOOK,
@@ -32,24 +33,6 @@ from sidestep.views.scene import (
     set_limits,
     tightest_period,
     world_at,
-)
-from sidestep.views.style import (
-    BLUE,
-    EVADER,
-    INK,
-    OBSTACLE,
-    OUTCOME_COLOURS,
-    OUTCOME_MARKERS,
-    OUTCOME_WORDS,
-    PURSUER,
-    TARGET,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-    shield_words,
 )
 from sidestep.world import Scenario
 
@@ -84,12 +67,12 @@ def trajectory_figure(
     period = tightest_period(trajectory)
     if moment is not None:
         period = int(np.clip(round(moment / float(scenario.control_period)), 0, trajectory.length))
-    with house_style():
+    with style.house_style():
         low, high = scene_limits(scenario, trajectory, shield=shield, period=period)
         spans = high - low
         # As high as the scene needs at full width, within reason.
-        scene_height = float(np.clip((WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
-        figure = new_figure(WIDTH, scene_height + 3.75)
+        scene_height = float(np.clip((style.WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
+        figure = style.new_figure(style.WIDTH, scene_height + 3.75)
         scene, key, barriers, corrections, answers = figure.subplots(
             5, 1, height_ratios=[scene_height + 0.4, 0.4, 1.3, 0.85, 0.16]
         )
@@ -106,9 +89,9 @@ def trajectory_figure(
         for upper in (barriers, corrections):
             upper.sharex(answers)
             upper.tick_params(axis="x", labelbottom=False)
-        words = f"{shield_words(shield)}: " if shield else ""
-        heading = title or f"{words}{OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
-        panel_titles(
+        words = f"{style.shield_words(shield)}: " if shield else ""
+        heading = title or f"{words}{style.OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
+        style.panel_titles(
             [scene, barriers, corrections, answers],
             [
                 heading[:1].upper() + heading[1:],
@@ -118,7 +101,7 @@ def trajectory_figure(
             ],
             in_caption=True,
         )
-        return save(figure, path)
+        return style.save(figure, path)
 
 
 def scenes_figure(
@@ -128,7 +111,7 @@ def scenes_figure(
 
     **Arguments:** `trajectories` by name of shield.
     """
-    with house_style():
+    with style.house_style():
         norm = correction_norm(scenario)
         low, high = common_limits(
             scene_limits(scenario, trajectory, shield=shield) for shield, trajectory in trajectories.items()
@@ -137,8 +120,8 @@ def scenes_figure(
         # Two columns from three scenes on: one below the other they would not fit a page.
         count, columns = len(trajectories), 1 if len(trajectories) <= 2 else 2
         rows = -(-count // columns)
-        height = float(np.clip((WIDTH - 1.3) / columns * spans[1] / spans[0], 1.5, 4.0))
-        figure = new_figure(WIDTH, (height + 0.35) * rows + 0.6)
+        height = float(np.clip((style.WIDTH - 1.3) / columns * spans[1] / spans[0], 1.5, 4.0))
+        figure = style.new_figure(style.WIDTH, (height + 0.35) * rows + 0.6)
         grid = figure.add_gridspec(rows + 1, columns, height_ratios=[height + 0.35] * rows + [0.4])
         axes = [figure.add_subplot(grid[divmod(index, columns)]) for index in range(count)]
         key = figure.add_subplot(grid[rows, :])
@@ -147,7 +130,7 @@ def scenes_figure(
             draw_scene(one, scenario, trajectory, norm, shield=shield, limits=(low, high))
             duration = trajectory.length * float(scenario.control_period)
             # Short, for half a page's width.
-            words = f"{shield_words(shield)}: {trajectory.outcome.replace('_', ' ')}, {duration:.2f} s"
+            words = f"{style.shield_words(shield)}: {trajectory.outcome.replace('_', ' ')}, {duration:.2f} s"
             titles.append(words[:1].upper() + words[1:])
         for index, one in enumerate(axes):
             if index + columns < count:
@@ -162,8 +145,8 @@ def scenes_figure(
         )
         bar.set_label("correction, m/s")
         bar.outline.set_visible(False)  # type: ignore[operator]
-        panel_titles(axes, titles)
-        return save(figure, path)
+        style.panel_titles(axes, titles)
+        return style.save(figure, path)
 
 
 def correction_norm(scenario: Scenario) -> Normalize:
@@ -255,55 +238,53 @@ def draw_scene(
     paths = np.asarray(trajectory.worlds.pursuers)
     for index in range(paths.shape[1]):
         draw_capture_set(axes, scenario, paths[period, index])
-        axes.plot(*paths[:, index, :2].T, color=PURSUER, linewidth=1.3, zorder=4)
-        draw_time_marks(axes, paths[:, index, :2], marks, length, PURSUER, dots=False)
+        axes.plot(*paths[:, index, :2].T, color=style.PURSUER, linewidth=1.3, zorder=4)
+        draw_time_marks(axes, paths[:, index, :2], marks, length, style.PURSUER, dots=False)
         for mark in (0, *marks):
             draw_pursuer(axes, paths[mark, index])
         draw_pursuer(axes, paths[period, index], size=0.11)
     evader = np.asarray(trajectory.worlds.evader)
-    draw_time_marks(axes, evader, marks, length, EVADER)
-    axes.plot(
-        *evader[0], "o", color=EVADER, markersize=5, markeredgecolor="white", markeredgewidth=0.7, zorder=7
-    )
-    axes.plot(
-        *evader[period], "o", color=EVADER, markersize=5.5, markeredgecolor=INK, markeredgewidth=0.9, zorder=7
-    )
+    draw_time_marks(axes, evader, marks, length, style.EVADER)
+    axes.plot(*evader[0], "o", zorder=7, **style.mark(style.EVADER, 5, width=0.7))
+    axes.plot(*evader[period], "o", zorder=7, **style.mark(style.EVADER, 5.5, style.INK, 0.9))
     axes.plot(*evader[-1], **_end_look(trajectory.outcome), zorder=9)
 
 
 def _end_look(outcome: str) -> dict[str, Any]:
     """How the end of the evader's path is marked."""
     if outcome in ("captured", "collided"):
-        look = {"marker": OUTCOME_MARKERS[outcome], "markersize": 9, "markeredgewidth": 0.8}
-        return look | {"color": OUTCOME_COLOURS[outcome], "markeredgecolor": "white", "linestyle": "none"}
-    colour = OUTCOME_COLOURS.get(outcome, INK)
-    look = {"marker": "s" if outcome == "timed_out" else "D", "markersize": 5.5, "markeredgewidth": 1.6}
-    return look | {"color": "white", "markeredgecolor": colour, "linestyle": "none"}
+        look = style.mark(style.OUTCOME_COLOURS[outcome], 9)
+        return look | {"marker": style.OUTCOME_MARKERS[outcome]}
+    colour = style.OUTCOME_COLOURS.get(outcome, style.INK)
+    return style.mark("white", 5.5, colour, 1.6) | {"marker": "s" if outcome == "timed_out" else "D"}
 
 
 def scene_legend(axes: Axes, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
     """The key of these scenes, in axes of its own, where it cannot cover anything."""
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=EVADER, marker="o", markersize=4, label="evader"),
-        Line2D([], [], color=PURSUER, marker=">", markersize=4, label="pursuer"),
+        Line2D([], [], color=style.EVADER, marker="o", markersize=4, label="evader"),
+        Line2D([], [], color=style.PURSUER, marker=">", markersize=4, label="pursuer"),
         Line2D([], [], **CAPTURE_SET_LOOK, label=capture_set_words(scenario)),
-        Patch(facecolor=PURSUER, alpha=0.25, label="capture distance"),
+        Patch(facecolor=style.PURSUER, alpha=0.25, label="capture distance"),
     ]
     if trajectories[0].worlds.obstacles.shape[1]:
-        handles.append(Patch(facecolor=OBSTACLE, alpha=0.35, label="collision distance"))
+        handles.append(Patch(facecolor=style.OBSTACLE, alpha=0.35, label="collision distance"))
     handles += [
-        Line2D([], [], color=INK, linewidth=1.0, label="h = 0"),
+        Line2D([], [], color=style.INK, linewidth=1.0, label="h = 0"),
         Line2D(
             [], [], color=LEVEL_COLOUR, linewidth=0.6, label=f"h = {', '.join(f'{h:g}' for h in LEVELS)} m"
         ),
-        Line2D([], [], color=TARGET, marker="*", linestyle="none", markersize=8, label="target"),
+        Line2D([], [], color=style.TARGET, marker="*", linestyle="none", markersize=8, label="target"),
         Line2D(
-            [], [], color=EVADER, marker="o", linestyle="none", markeredgecolor=INK, markersize=5,
-            markeredgewidth=0.9, label="evader when sets are drawn",
+            [],
+            [],
+            marker="o",
+            label="evader when sets are drawn",
+            **style.mark(style.EVADER, 5, style.INK, 0.9),
         ),
-    ]  # fmt: skip
+    ]
     for outcome in dict.fromkeys(trajectory.outcome for trajectory in trajectories):
-        handles.append(Line2D([], [], **_end_look(outcome), label=OUTCOME_WORDS[outcome]))
+        handles.append(Line2D([], [], **_end_look(outcome), label=style.OUTCOME_WORDS[outcome]))
     axes.set_axis_off()
     axes.legend(handles=handles, loc="center", ncols=5, columnspacing=1.4, handletextpad=0.5, fontsize=7)
 
@@ -322,23 +303,23 @@ def _stretches(scenario: Scenario, flags: np.ndarray) -> list[tuple[float, float
 def _shade_infeasible(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
     """Background where the shield could not satisfy its rows."""
     for begin, duration in _stretches(scenario, np.asarray(trajectory.status) == Status.INFEASIBLE):
-        axes.axvspan(begin, begin + duration, color=PURSUER, alpha=0.18, linewidth=0)
+        axes.axvspan(begin, begin + duration, color=style.PURSUER, alpha=0.18, linewidth=0)
 
 
 def draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
     """h towards every pursuer and obstacle over time, on a square-root scale."""
     times, values = _times(scenario, trajectory), np.asarray(trajectory.barriers)
     pursuers = trajectory.worlds.pursuers.shape[1]
-    light_grid(axes, "y")
+    style.light_grid(axes, "y")
     _shade_infeasible(axes, scenario, trajectory)
     for index in range(values.shape[1]):
         chased = index < pursuers
-        colour, word = (PURSUER, "pursuer") if chased else (OBSTACLE, "obstacle")
+        colour, word = (style.PURSUER, "pursuer") if chased else (style.OBSTACLE, "obstacle")
         first = index in (0, pursuers)
         axes.plot(
             times, values[:, index], color=colour, linewidth=1.3, label=f"h towards {word}" if first else None
         )
-    axes.axhline(0.0, color=INK, linewidth=1.0)
+    axes.axhline(0.0, color=style.INK, linewidth=1.0)
     finite = values[np.isfinite(values)]
     highest, lowest = float(np.max(finite, initial=0.1)), float(np.min(finite, initial=0.0))
     # Margins of millimetres and distances of metres in one strip.
@@ -356,7 +337,7 @@ def draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
 def draw_corrections(axes: Axes, scenario: Scenario, trajectory: Trajectory, norm: Normalize) -> None:
     """How far the shield changed the velocity over time, in the colours of the path."""
     times, correction = _times(scenario, trajectory), np.asarray(trajectory.intervention)
-    light_grid(axes, "y")
+    style.light_grid(axes, "y")
     _shade_infeasible(axes, scenario, trajectory)
     axes.bar(
         times,
@@ -366,7 +347,7 @@ def draw_corrections(axes: Axes, scenario: Scenario, trajectory: Trajectory, nor
         color=correction_colours()(norm(correction)),
         linewidth=0,
     )
-    axes.step(times, correction, where="post", color=INK, linewidth=0.5)
+    axes.step(times, correction, where="post", color=style.INK, linewidth=0.5)
     axes.set_ylim(0.0, 2.1 * float(scenario.evader_speed))
     axes.set_ylabel("m/s")
     if np.max(correction, initial=0.0) <= 1e-6:
@@ -376,7 +357,7 @@ def draw_corrections(axes: Axes, scenario: Scenario, trajectory: Trajectory, nor
 
 
 def _mark_moment(axes: Axes, now: float) -> None:
-    axes.axvline(now, color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.axvline(now, color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
 
 
 def _say_moment(axes: Axes, now: float, duration: float) -> None:
@@ -389,9 +370,9 @@ def _say_moment(axes: Axes, now: float, duration: float) -> None:
 
 ANSWERS = {
     Status.OK: ("#DDDDDD", "unchanged"),
-    Status.CORRECTED: (BLUE, "corrected"),
-    Status.INFEASIBLE: (PURSUER, "not all rows can hold"),
-    Status.INVALID: (INK, "invalid input"),
+    Status.CORRECTED: (style.BLUE, "corrected"),
+    Status.INFEASIBLE: (style.PURSUER, "not all rows can hold"),
+    Status.INVALID: (style.INK, "invalid input"),
 }
 
 

@@ -10,18 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from sidestep.loop import Trajectory
-from sidestep.views.style import (
-    BLUE,
-    GREY,
-    INK,
-    OUTCOME_WORDS,
-    WIDTH,
-    house_style,
-    light_grid,
-    new_figure,
-    panel_titles,
-    save,
-)
+from sidestep.views import style
 from sidestep.views.trajectory_figures import (
     common_limits,
     correction_norm,
@@ -50,23 +39,22 @@ def twin_figure(
 
     Writes PNG and PDF; returns their paths.
     """
-    with house_style():
+    with style.house_style():
         both = {"simulation": simulation, twin_words: twin}
         limits = common_limits(
             scene_limits(scenario, trajectory, shield=shield, near=near) for trajectory in both.values()
         )
         spans = limits[1] - limits[0]
-        height = float(np.clip((WIDTH - 0.7) * spans[1] / spans[0], 1.5, 3.6))
-        figure = new_figure(WIDTH, 2 * height + 4.2)
+        height = float(np.clip((style.WIDTH - 0.7) * spans[1] / spans[0], 1.5, 3.6))
+        figure = style.new_figure(style.WIDTH, 2 * height + 4.2)
         heights = [height + 0.35, height + 0.35, 0.45, 1.2, 1.2]
         upper, lower, key, pursuers, obstacles = figure.subplots(5, 1, height_ratios=heights)
         norm, titles = correction_norm(scenario), []
         for axes, (words, trajectory) in zip((upper, lower), both.items(), strict=True):
             draw_scene(axes, scenario, trajectory, norm, shield=shield, limits=limits)
             duration = trajectory.length * float(scenario.control_period)
-            titles.append(
-                f"{words[0].upper()}{words[1:]}: {OUTCOME_WORDS[trajectory.outcome]} after {duration:.2f} s"
-            )
+            outcome = style.OUTCOME_WORDS[trajectory.outcome]
+            titles.append(f"{words[0].upper()}{words[1:]}: {outcome} after {duration:.2f} s")
         upper.set_xlabel("")
         upper.tick_params(labelbottom=False)
         scene_legend(key, scenario, list(both.values()))
@@ -75,11 +63,14 @@ def twin_figure(
             (pursuers, "pursuers", float(scenario.capture_distance)),
             (obstacles, "obstacles", float(scenario.collision_distance)),
         ):
-            for trajectory, colour, words in ((simulation, GREY, "simulation"), (twin, BLUE, twin_words)):
+            for trajectory, colour, words in (
+                (simulation, style.GREY, "simulation"),
+                (twin, style.BLUE, twin_words),
+            ):
                 _draw_distance(axes, _distances(trajectory, name), period, colour, words)
-            axes.axhline(least, color=INK, linewidth=1.0)
+            axes.axhline(least, color=style.INK, linewidth=1.0)
             _scale(axes, least, name, both.values())
-            light_grid(axes, "y")
+            style.light_grid(axes, "y")
         pursuers.sharex(obstacles)
         pursuers.tick_params(axis="x", labelbottom=False)
         # Beside the title, where no curve runs.
@@ -90,8 +81,8 @@ def twin_figure(
             "Distance to the nearest pursuer; black: captured",
             "Distance to the nearest obstacle; black: collided",
         ]
-        panel_titles([upper, lower, pursuers, obstacles], titles)
-        return save(figure, path)
+        style.panel_titles([upper, lower, pursuers, obstacles], titles)
+        return style.save(figure, path)
 
 
 def _scale(axes: Axes, least: float, name: str, trajectories: Iterable[Trajectory]) -> None:

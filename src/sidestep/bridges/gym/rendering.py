@@ -12,10 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sidestep._packages import needed
+from sidestep.views import style
 from sidestep.views.motion import Instant
 from sidestep.views.moving_panel import MovingPanel
 from sidestep.views.scene import correction_colours
-from sidestep.views.style import INK, OBSTACLE, PURSUER, house_style, light_grid
 from sidestep.views.trajectory_figures import ANSWERS
 from sidestep.world import Scenario, World, to_velocity
 
@@ -114,7 +114,7 @@ class Picture:
         evader = self._path("evader")
         others = [
             (path, colour)
-            for part, colour in (("pursuers", PURSUER), ("obstacles", OBSTACLE))
+            for part, colour in (("pursuers", style.PURSUER), ("obstacles", style.OBSTACLE))
             for path in np.moveaxis(self._path(part)[..., :2], 1, 0)
         ]
         sizes = np.array(self._corrections)
@@ -137,19 +137,19 @@ class Picture:
         while half < reach:
             half *= _WIDENED
         self._half = half
-        with house_style():
+        with style.house_style():
             figure = Figure(figsize=(_PIXELS / _DPI, _PIXELS / _DPI), dpi=_DPI)
             self._canvas = FigureCanvasAgg(figure)
             axes = figure.add_axes((0.085, 0.065, 0.89, 0.89))
             axes.set_xlim(-half, half)
             axes.set_ylim(-half, half)
-            light_grid(axes)
+            style.light_grid(axes)
             now = self._instant()
             others = len(now.poses) + len(now.obstacles)
             self._panel = MovingPanel(
                 axes, self._scenario, now, trails=others, pursuit=self._pursuit, levels=_LEVELS
             )
-            self._words = figure.text(0.085, 0.965, "", color=INK, fontsize=9.0, fontweight="bold")
+            self._words = figure.text(0.085, 0.965, "", color=style.INK, fontsize=9.0, fontweight="bold")
             self._words.set_animated(True)
             self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(figure.bbox)
