@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import subprocess
 import threading
 
 import pytest
@@ -21,6 +22,14 @@ def store(tmp_path):
     store = Store(tmp_path / "campaign")
     store.begin("mine", "name = 'mine'")
     return store
+
+
+@pytest.fixture
+def gone():
+    """The number of a process that has ended."""
+    with subprocess.Popen(["true"]) as process:
+        pass
+    return process.pid
 
 
 def record(job, value=1.0):
@@ -127,6 +136,17 @@ def test_folder_of_another_program_is_refused_and_not_written_to(tmp_path):
     file.write_text("")
     with pytest.raises(ValueError, match="is a file"):
         Store(file).begin("x", "")
+
+
+def test_begin_removes_what_a_killed_command_left_and_nothing_of_the_workers(store, gone):
+    left = [store.folder / f".sidestep-{gone}-x", store.folder / f".campaign.toml.{gone}.tmp"]
+    theirs = store.run_folder("job") / f".summary.json.{gone}.tmp"
+    for path in (left[0] / f".probe.{gone}.tmp", left[1], theirs):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    store.begin("mine", "name = 'mine'")
+    assert not any(path.exists() for path in left)
+    assert theirs.exists()
 
 
 def test_begin_goes_on_where_a_kill_left_it(tmp_path):

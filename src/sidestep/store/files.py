@@ -197,21 +197,24 @@ def _into_stream(path: Path) -> Iterator[Path]:
         file.write(content)
 
 
-def sweep(folder: str | Path) -> None:
-    """Remove what kills in the middle of `whole_file` and `try_outputs` have left in a folder and below it.
+def sweep(folder: str | Path, *, below: bool = True) -> None:
+    """Remove what kills in the middle of `whole_file` and `try_outputs` have left in a folder and `below` it.
 
     What names a process counts as left when that process is gone; a campaign's result, whose name ends in 32
     hexadecimal digits because its worker may be on another host, when it is an hour old. All else stays.
     """
     # Unlike `rglob`, `os.walk` passes over a folder that vanishes meanwhile.
-    for inside, _, names in os.walk(folder, topdown=False):
+    for inside, folders, names in os.walk(folder):
         for name in names:
             path = Path(inside, name)
             if name.startswith(".") and path.suffix == ".tmp" and _is_left(path, path.stem.split(".")[-1]):
                 path.unlink(missing_ok=True)
-        probe = Path(inside)
-        if probe.name.startswith(PROBE) and _is_left(probe, probe.name.removeprefix(PROBE).split("-")[0]):
-            shutil.rmtree(probe, ignore_errors=True)
+        for name in folders:
+            probe = Path(inside, name)
+            if name.startswith(PROBE) and _is_left(probe, name.removeprefix(PROBE).split("-")[0]):
+                shutil.rmtree(probe, ignore_errors=True)
+        if not below:
+            return
 
 
 def _is_left(path: Path, writer: str) -> bool:
