@@ -17,7 +17,7 @@ from sidestep.loop.keys import evaluation_seed
 from sidestep.loop.policies import GOAL_SEEKING
 from sidestep.loop.rollout import Trajectory, load_trajectory, rollout, save_trajectory
 from sidestep.pursuit import make_pursuer
-from sidestep.safety import SHIELDS, Status, make_shield
+from sidestep.safety import Status, make_shield
 from sidestep.store import runs as records
 from sidestep.store.files import json_safe, read_json, write_json
 from sidestep.trials.captures import examine_captures
@@ -37,6 +37,9 @@ PAPER: dict[str, Any] = {
     "scene_trained": {"outcome": "reached"},
 }
 """What the paper reports (section IV and its Table I), under the names of our own figures."""
+
+COMPARED = ("none", "paper", "game", "joint")
+"""Shields that are compared unless others are named. A newly registered one is not."""
 
 Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
 """Opens a progress display for a labelled part: a context manager that gives a callable."""
@@ -131,7 +134,7 @@ def reproduce(
     out: str | Path,
     *,
     scenario: Scenario | None = None,
-    shields: Sequence[str] = tuple(SHIELDS),
+    shields: Sequence[str] = COMPARED,
     pursuer: str = "nash",
     seed: int = 0,
     episodes: int = 200,

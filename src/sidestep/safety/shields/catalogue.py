@@ -27,7 +27,7 @@ SHIELDS: dict[str, type[Shield]] = {
     "game": GameShield,
     "joint": JointShield,
 }
-"""Every shield by name."""
+"""Every shield by name, weakest first: figures and reports keep that order."""
 BARRIERS: dict[str, Barrier] = {
     "obstacle": ObstacleBarrier(),
     "range": RangeBarrier(),
