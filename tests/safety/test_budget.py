@@ -11,6 +11,7 @@ import pytest
 from sidestep.loop.step import outcome_of
 from sidestep.pursuit import CaptureGame, make_pursuer
 from sidestep.safety import Budget, BudgetWarning, GameShield, JointShield, certify, make_shield
+from sidestep.safety.shields import catalogue
 from sidestep.world import World, load_scenario
 
 # The evader heads for the target and stays there, while the pursuer comes again and again.
@@ -153,6 +154,14 @@ def test_a_budget_within_the_game_is_silent_and_the_certificate_agrees_about_its
 def test_a_budget_that_cannot_be_is_refused_with_its_part(wrong, words):
     with pytest.raises(ValueError, match=words):
         make_shield("joint", load_scenario("paper"), Budget(**wrong))
+
+
+def test_any_registered_shield_that_keeps_the_pursuit_barrier_is_given_the_budget(monkeypatch):
+    monkeypatch.setitem(catalogue.SHIELDS, "another", GameShield)
+    monkeypatch.setattr(catalogue, "PURSUIT_SHIELDS", (*catalogue.PURSUIT_SHIELDS, "another"))
+    scenario, budget = load_scenario("paper", capture_distance=0.15), Budget(position_error=0.001)
+    for name in catalogue.PURSUIT_SHIELDS:
+        assert eqx.tree_equal(make_shield(name, scenario, budget).budget, budget), name
 
 
 def test_shields_that_keep_no_budget_say_so():

@@ -40,7 +40,7 @@ PURSUIT_SHIELDS = tuple(name for name, kind in SHIELDS.items() if kind.keeps_pur
 
 
 def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> Shield:
-    """The shield `name` (a key of `SHIELDS`) for a scenario; `budget` for `game` and `joint` only.
+    """The shield `name` (a key of `SHIELDS`) for a scenario; `budget` for those of `PURSUIT_SHIELDS` only.
 
     For custom robots (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
 
@@ -66,7 +66,8 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         budget.announce(scenario)
     if name == "game":
         return GameShield(scenario, budget, goes_round=True)
-    return JointShield(scenario, budget=budget) if name == "joint" else SHIELDS[name](scenario)
+    kind: Any = SHIELDS[name]
+    return kind(scenario, budget=budget) if name in PURSUIT_SHIELDS else kind(scenario)
 
 
 def _announce_beyond(covering: Scenario) -> None:
