@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sidestep.pursuit import PURSUERS, make_pursuer, pursue
-from sidestep.safety import GameShield, Status, project
+from sidestep.safety import SHIELDS, GameShield, Status, make_shield, project
 from sidestep.safety.filter.projection import project_known
 from sidestep.world import load_scenario
 
@@ -20,7 +20,20 @@ def _in_lanes(tree):
 
 
 def _worlds(scenario):
-    return jax.vmap(scenario.reset)(jax.random.split(jax.random.key(5), 15))
+    """Fifteen starts, each at another time."""
+    worlds = jax.vmap(scenario.reset)(jax.random.split(jax.random.key(5), 15))
+    return eqx.tree_at(lambda w: w.time, worlds, 0.3 * jnp.arange(15.0))
+
+
+def _near(scenario):
+    """Everything drawn closer to the evader, so that rows are active, and some cannot all be kept."""
+    worlds = _worlds(scenario)
+    closer = lambda group: group.at[..., :2].multiply(0.25)  # noqa: E731
+    return eqx.tree_at(
+        lambda w: (w.evader, w.pursuers, w.obstacles),
+        worlds,
+        (0.25 * worlds.evader, closer(worlds.pursuers), closer(worlds.obstacles)),
+    )
 
 
 def _close(one, other):
@@ -28,8 +41,7 @@ def _close(one, other):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-6)
 
 
-# random draws one pair of wheel speeds for everybody, which lanes do not ask for
-@pytest.mark.parametrize("name", sorted(set(PURSUERS) - {"random"}))
+@pytest.mark.parametrize("name", [name for name, kind in PURSUERS.items() if kind.takes_lanes])
 def test_pursuers_and_motion(name):
     scenario, key = load_scenario("paper", pursuer_count=2, obstacle_count=2), jax.random.key(0)
     worlds, pursuer = _worlds(scenario), make_pursuer(name)
@@ -44,17 +56,25 @@ def test_pursuers_and_motion(name):
     )
 
 
+@pytest.mark.parametrize("name", SHIELDS)
+def test_every_shield_that_takes_lanes(name):
+    scenario = load_scenario("paper", pursuer_count=2, obstacle_count=2)
+    shield, worlds = make_shield(name, scenario), _near(scenario)
+    if not shield.takes_lanes:
+        pytest.skip("asked for each world in turn")
+    wish = 0.2 * jax.random.normal(jax.random.key(1), (15, 2))
+
+    def answer(world, wish):
+        return shield(world, wish, shield.init(world))
+
+    expected = _in_lanes(jax.jit(jax.vmap(answer))(worlds, wish))
+    _close(jax.jit(answer)(_in_lanes(worlds), _in_lanes(wish)), expected)
+
+
 @pytest.mark.parametrize("fields", [{}, {"action": "heading"}, {"pursuer_count": 2, "obstacle_count": 3}])
 def test_shield_and_its_short_form(fields):
     scenario = load_scenario("paper", **fields)
-    shield, worlds = GameShield(scenario), _worlds(scenario)
-    # Everything drawn closer to the evader, so that rows are active, and some cannot all be kept.
-    closer = lambda group: group.at[..., :2].multiply(0.25)  # noqa: E731
-    worlds = eqx.tree_at(
-        lambda w: (w.evader, w.pursuers, w.obstacles),
-        worlds,
-        (0.25 * worlds.evader, closer(worlds.pursuers), closer(worlds.obstacles)),
-    )
+    shield, worlds = GameShield(scenario), _near(scenario)
     wish = 0.11 * jax.random.normal(jax.random.key(1), (15, 2)).clip(-1.0, 1.0)
     memory = jax.vmap(shield.init)(worlds)
     expected = _in_lanes(eqx.filter_jit(jax.vmap(shield.__call__))(worlds, wish, memory))
