@@ -83,6 +83,24 @@ def test_commands_that_are_not_finite_are_a_stop(plant, start):
     assert np.linalg.norm(np.asarray(plant.world.evader) - np.asarray(start.evader)) < 0.01
 
 
+def test_a_command_beyond_the_limit_is_cut_to_it_before_anything_else(plant, start):
+    """Cut later, an evader with a lag would reach its speed, and stop, as no evader can."""
+
+    def drive(times):
+        plant.reset(start, 3)
+        for share in (1.0, 1.0, 0.0, 0.0):
+            speed = times * share * float(plant.scenario.evader_speed)
+            plant.command(
+                np.array([speed, 0.0]), np.full((1, 2), times * float(plant.scenario.pursuer_speed))
+            )
+            plant.advance(0.05)
+        return plant.world
+
+    at_the_limit, beyond = drive(1.0), drive(20.0)
+    np.testing.assert_allclose(beyond.evader, at_the_limit.evader, atol=1e-5)
+    np.testing.assert_allclose(beyond.pursuers, at_the_limit.pursuers, atol=1e-5)
+
+
 def test_a_world_with_other_robots_is_refused(plant):
     world = dataclasses.replace(plant.scenario, pursuer_count=2).reset(jax.random.key(0))
     with pytest.raises(TwinError, match="2 pursuers"):
