@@ -94,7 +94,7 @@ class AdaptedShield(Shield):
         return self.inner.looks_ahead
 
     @property
-    def takes_lanes(self) -> bool:
+    def takes_lanes(self) -> bool:  # type: ignore[override]
         return self.inner.takes_lanes
 
     def init(self, world: World) -> Any:

@@ -69,7 +69,7 @@ class GameShield(Shield):
             raise ValueError("the rows for a known velocity keep no budget; leave out one of the two")
 
     @property
-    def takes_lanes(self) -> bool:
+    def takes_lanes(self) -> bool:  # type: ignore[override]
         return not self.known_velocity
 
     def init(self, world: World) -> Any:

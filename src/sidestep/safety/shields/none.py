@@ -21,11 +21,8 @@ class NoShield(Shield):
     Status `OK`, `CORRECTED` (by the speed limit), or `INVALID` and a stop for a non-finite action or world.
     """
 
+    takes_lanes = True
     scenario: Scenario
-
-    @property
-    def takes_lanes(self) -> bool:
-        return True
 
     def init(self, world: World) -> Any:
         return RangeBarrier().update_memories(self.scenario, world)

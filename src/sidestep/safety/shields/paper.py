@@ -22,11 +22,8 @@ class PaperShield(Shield):
     violates the pursuers' rows least, and after that the obstacles' rows least.
     """
 
+    takes_lanes = True
     scenario: Scenario
-
-    @property
-    def takes_lanes(self) -> bool:
-        return True
 
     def init(self, world: World) -> Any:
         return RangeBarrier().update_memories(self.scenario, world)

@@ -40,6 +40,8 @@ class Shield(eqx.Module):
     scenario: eqx.AbstractVar[Scenario]
     keeps_pursuit_barrier: ClassVar[bool] = False
     """Whether its rows towards pursuers are those of the `PursuitBarrier`; such a shield takes a budget."""
+    takes_lanes: ClassVar[bool] = False
+    """Whether it takes many worlds in lanes; others are called for each world (`filter_in_lanes`)."""
 
     @property
     def rows_only(self) -> "Shield":
@@ -51,11 +53,6 @@ class Shield(eqx.Module):
     def looks_ahead(self) -> bool:
         """Whether it does more than rows. A decision then costs thousands of times as much."""
         return self.rows_only is not self
-
-    @property
-    def takes_lanes(self) -> bool:
-        """Whether it takes many worlds in lanes; others are called for each world (`filter_in_lanes`)."""
-        return False
 
     @property
     def unadapted(self) -> "Shield":
