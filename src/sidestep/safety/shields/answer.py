@@ -87,18 +87,18 @@ def correction(
     return root(x * x + y * y)
 
 
-def as_turned(
-    result: ShieldResult, nominal: Float[AnyArray, "2 *lanes"], turn: Float[AnyArray, "*lanes"]
+def as_changed(
+    result: ShieldResult, nominal: Float[AnyArray, "2 *lanes"], changed: Bool[Array, "*lanes"]
 ) -> ShieldResult:
-    """The answer to a nominal action that was turned aside (`turn` not 0), reported as one to `nominal`."""
-    aside = turn != 0.0
+    """The answer to an action that a shield put in place of `nominal` (where `changed`), as one to `nominal`:
+    at least `CORRECTED`, and with the whole intervention."""
     moved = correction(result.action, jnp.where(_finite(nominal), nominal, 0.0))
     return eqx.tree_at(
         lambda result: (result.status, result.intervention),
         result,
         (
-            jnp.where(aside, jnp.maximum(result.status, Status.CORRECTED), result.status),
-            jnp.where(aside, moved, result.intervention),
+            jnp.where(changed, jnp.maximum(result.status, Status.CORRECTED), result.status),
+            jnp.where(changed, moved, result.intervention),
         ),
     )
 

@@ -16,7 +16,7 @@ from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
 from sidestep.safety.barriers.sampling_margin import margins, sampling_margin, with_margins
 from sidestep.safety.filter.projection import project_known
 from sidestep.safety.filter.status import Status
-from sidestep.safety.shields.answer import as_turned, decide, known_parts, with_obstacles
+from sidestep.safety.shields.answer import as_changed, decide, known_parts, with_obstacles
 from sidestep.safety.shields.going_round import next_turn, still_turned, turned
 from sidestep.safety.shields.shield import Shield, ShieldResult
 from sidestep.world.scenario import Scenario
@@ -89,7 +89,7 @@ class GameShield(Shield):
         nominal = jnp.asarray(nominal, world.evader.dtype)
         turn = still_turned(kept, world, nominal, memory.turn)
         result, sides = self._filtered(world, turned(nominal, turn), memory.sides)
-        result = as_turned(result, nominal, turn)
+        result = as_changed(result, nominal, turn != 0.0)
         towards_pursuers = result.barriers[: self.scenario.pursuer_count]
         turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
         turn = jnp.where(result.status == Status.INVALID, 0.0, turn)

@@ -16,7 +16,7 @@ from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.sampling_margin import with_margins
 from sidestep.safety.filter.status import Status
-from sidestep.safety.shields.answer import as_turned, correction
+from sidestep.safety.shields.answer import as_changed, correction
 from sidestep.safety.shields.escape_plan import (
     CHOICES,
     SEGMENTS,
@@ -217,7 +217,7 @@ class JointShield(Shield):
         action was accepted."""
         game = self.rows_only
         greedy, sides = game(world, turned(nominal, turn), memory.sides)
-        greedy = as_turned(greedy, nominal, turn)
+        greedy = as_changed(greedy, nominal, turn != 0.0)
         m = self.scenario.pursuer_count
         if m == 0 or m + self.scenario.obstacle_count == 1:
             return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides), jnp.ones((), bool)
