@@ -26,7 +26,7 @@ help: ## This list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  ARGS='...' adds options, for example: make reproduce ARGS='--seed 1'"
 
-setup: $(READY_DEV) ## Create .venv with sidestep, every extra, tests and documentation (2.0 GB)
+setup: $(READY_DEV) ## Create .venv with sidestep, every extra, tests and documentation (2.1 GB)
 
 $(READY): requirements.lock pyproject.toml
 	@$(PY) -c '' 2>/dev/null || { \
@@ -51,8 +51,8 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 $(READY_DEV): requirements-dev.lock | $(READY)
-	@echo "Installing what requirements-dev.lock pins for tests, documentation and every extra (370 MB more to download,"
-	@echo "2.0 GB on disk in all)"
+	@echo "Installing what requirements-dev.lock pins for tests, documentation and every extra (430 MB more to download,"
+	@echo "2.1 GB on disk in all)"
 	@$(INSTALL) --require-hashes -r requirements-dev.lock
 	@touch $@
 

@@ -23,6 +23,7 @@ NOT_FOR_USERS = {"dev", "docs", "bench"}
 
 BRIEF = "--shield none --episodes 1"
 COMMANDS = {
+    "clearance": "python table.py",
     "cluster": "sidestep campaign grid.toml --workers 1 --out grid",
     "export": "sidestep export run --out robot.onnx",
     "gym": "python step.py",
@@ -34,6 +35,13 @@ COMMANDS = {
 """The smallest real command of each extra."""
 FILES = {
     "grid.toml": 'kind = "evaluate"\n[grid]\nseed = [0]\nshield = ["none"]\n[settings]\nepisodes = 1\n',
+    "table.py": (
+        "import sidestep\n"
+        "from sidestep.safety.clearance import ClearanceGame, Resolution, clearance_table\n"
+        "game = ClearanceGame.of(sidestep.load_scenario('paper', capture_distance=0.1))\n"
+        "few = Resolution(height=0.01, growth=1.5, share=0.1, bearings=4, angles=24, headings=12, turns=2)\n"
+        "print(clearance_table(game, few, periods=5).farthest)\n"
+    ),
     "step.py": (
         "import sidestep.bridges.gym\n"
         "import gymnasium\n"

@@ -1,0 +1,7 @@
+"""How far away must an obstacle be? The table that answers it for pursuer and obstacle together."""
+
+from sidestep.safety.clearance.game import ClearanceGame
+from sidestep.safety.clearance.solve import Resolution, Solution, solve
+from sidestep.safety.clearance.table import ClearanceTable, clearance_table
+
+__all__ = ["ClearanceGame", "ClearanceTable", "Resolution", "Solution", "clearance_table", "solve"]

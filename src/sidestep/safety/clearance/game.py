@@ -1,0 +1,108 @@
+"""The numbers of a game of evader, pursuer and obstacle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.safety.certificate.sampled_design import COARSE, best_angle
+from sidestep.safety.certificate.sampled_game import SampledGame
+from sidestep.world import Scenario
+
+
+@dataclass(frozen=True)
+class ClearanceGame:
+    """An evader between one pursuer and one obstacle, in SI units.
+
+    The evader (`evader_speed` v_e, holonomic) decides once per `control_period` T; the pursuer (rim speed V,
+    `half_axle` b) must stay at least `capture_distance` l away, the obstacle, which drifts at up to
+    `obstacle_speed` v_c in any direction, at least `collision_distance` d. `angle` S' > S is the design angle
+    of the set that the evader keeps from the pursuer.
+    """
+
+    evader_speed: float
+    pursuer_speed: float
+    half_axle: float
+    capture_distance: float
+    collision_distance: float
+    obstacle_speed: float
+    control_period: float
+    angle: float
+
+    @staticmethod
+    def of(
+        scenario: Scenario, *, angle: float | None = None, obstacle_speed: float | None = None
+    ) -> ClearanceGame:
+        """That of a scenario.
+
+        **Arguments:** `angle` S' (rad), by default that with the most slack against the pursuer alone;
+        `obstacle_speed` (m/s) for more than the scenario's own drift.
+
+        **Raises** `ValueError` where no angle lets the evader keep the capture distance at this period.
+        """
+        scenario.check_built_in("a clearance table", "there is none for other robots")
+        if angle is None:
+            angle = _best_angle(scenario)
+        drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
+        return ClearanceGame(
+            evader_speed=float(scenario.evader_speed),
+            pursuer_speed=float(scenario.pursuer_speed),
+            half_axle=float(scenario.pursuer_half_axle),
+            capture_distance=float(scenario.capture_distance),
+            collision_distance=float(scenario.collision_distance),
+            obstacle_speed=drift if obstacle_speed is None else obstacle_speed,
+            control_period=float(scenario.control_period),
+            angle=angle,
+        )
+
+    @property
+    def as_dict(self) -> dict[str, float]:
+        """Every number by name."""
+        return asdict(self)
+
+    def velocities(self, headings: int) -> Float[np.ndarray, "n 2"]:
+        """What the evader chooses from, m/s: full speed in evenly spread headings, those along the tip's
+        normals exactly, and a stop."""
+        heading = 2.0 * math.pi * np.arange(headings) / headings
+        for normal in (self.angle, math.pi - self.angle, math.pi + self.angle, 2.0 * math.pi - self.angle):
+            heading[np.argmin(np.abs(heading - normal))] = normal
+        full = self.evader_speed * np.stack([np.cos(heading), np.sin(heading)], -1)
+        return np.concatenate([full, np.zeros((1, 2))])
+
+    def motions(self, turns: int, drives: int) -> Float[np.ndarray, "n 3"]:
+        """Poses (m, m, rad) that the pursuer can reach in one period: the edge of what it reaches.
+
+        For each of 2 `turns` + 1 final headings it drives as far as that turn leaves it, forwards and
+        backwards, along `drives` headings from the first to the last.
+        """
+        period = self.control_period
+        most = self.pursuer_speed * period / self.half_axle
+        turn = np.linspace(-most, most, 2 * turns + 1)
+        left = self.pursuer_speed * period - self.half_axle * np.abs(turn)
+        along = turn[:, None] * np.linspace(0.0, 1.0, drives)
+        poses = [
+            np.stack([end * left[:, None] * np.cos(along), end * left[:, None] * np.sin(along)], -1)
+            for end in (1.0, -1.0)
+        ]
+        heading = np.broadcast_to(turn[None, :, None, None], (2, *along.shape, 1))
+        return np.unique(np.concatenate([np.stack(poses), heading], -1).reshape(-1, 3).round(15), axis=0)
+
+
+def _best_angle(scenario: Scenario) -> float:
+    game = SampledGame(
+        float(scenario.evader_speed),
+        float(scenario.pursuer_speed),
+        float(scenario.pursuer_half_axle),
+        float(scenario.control_period),
+    )
+    level = float(scenario.capture_distance)
+    angle, slack = best_angle(game, level, COARSE)
+    if not slack >= 0.0:
+        raise ValueError(
+            f"no design angle keeps the pursuer {level:g} m away at a period of {game.control_period:g} s "
+            "for ever, so there is no clearance table; `sidestep certify` shows what would do"
+        )
+    return angle

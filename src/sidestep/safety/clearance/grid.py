@@ -1,0 +1,196 @@
+"""Where the clearance table has its nodes, and where a state lies between them.
+
+The state is z, the evader in the pursuer's frame, and phi, the direction in that frame in which the evader
+lies from the obstacle. By mirroring and reversing the pursuer z lies in the first quadrant. There, with the
+normals n_l, n_r = (cos S', +-sin S') of the capture set's tip,
+
+    a = max(n_l.z, |z| beyond the usable part) - l       how far the evader is outside on its own side,
+    b = n_r.z - l                                        how far it is outside on the other side,
+
+and the table has two regions, between which nothing is interpolated:
+
+- *open*, b >= 0: the evader may still choose the side; nodes on a grid of (a, b);
+- *committed*, b < 0 or beyond the usable part: it must pass on its own side; nodes on a grid of a and of the
+  way along the capture set's edge, first the straight part, by b, then the arc, by bearing.
+
+So the capture set's edge a = 0 and the surface b = 0, across which clearance jumps, are grid lines. Clearance
+has a sharp ridge in phi, where passing the obstacle on either side costs the same. Rows of the table are
+aligned by it: phi counts from `ridge`, an angle per node, and the nodes in phi are densest there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Reals = Float[np.ndarray, "..."]
+
+
+class Spacing(NamedTuple):
+    """Nodes first (g^i - 1)/(g - 1), i < count: `first` apart at 0, growing by `growth` g > 1."""
+
+    first: float
+    growth: float
+    count: int
+
+    @staticmethod
+    def up_to(last: float, first: float, growth: float) -> Spacing:
+        """With the last node at `last`."""
+        steps = math.ceil(math.log1p(last * (growth - 1.0) / first) / math.log(growth))
+        return Spacing(last * (growth - 1.0) / (growth**steps - 1.0), growth, steps + 1)
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "n"]:
+        """Every node."""
+        return self.first * (self.growth ** np.arange(self.count) - 1.0) / (self.growth - 1.0)
+
+    def place(self, xp: Any, value: Any) -> tuple[Any, Any]:
+        """Cell and weight of its upper node; beyond the ends the weight is 0 or 1."""
+        growth = self.growth
+        index = xp.log1p(xp.maximum(value, 0.0) * (growth - 1.0) / self.first) / math.log(growth)
+        cell = xp.clip(xp.floor(index), 0, self.count - 2)
+        low = self.first * (growth**cell - 1.0) / (growth - 1.0)
+        weight = (value - low) / (self.first * growth**cell)
+        return cell.astype(xp.int32), xp.clip(weight, 0.0, 1.0)
+
+
+class Angles(NamedTuple):
+    """Directions f sinh(k (i - count/2)) from -pi up: densest, f k apart, at 0; `count` is even."""
+
+    scale: float
+    count: int
+
+    @property
+    def rate(self) -> float:
+        """k, 1."""
+        return 2.0 * math.asinh(math.pi / self.scale) / self.count
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "n"]:
+        """Every node, rad."""
+        return self.scale * np.sinh(self.rate * (np.arange(self.count) - self.count // 2))
+
+    def place(self, xp: Any, angle: Any) -> tuple[Any, Any]:
+        """Node at or below an angle, and the weight of the next one, which is the first after the last."""
+        angle = angle - 2.0 * math.pi * xp.floor((angle + math.pi) / (2.0 * math.pi))
+        index = self.count // 2 + xp.arcsinh(angle / self.scale) / self.rate
+        node = xp.clip(xp.floor(index), 0, self.count - 1)
+        low = self.scale * xp.sinh(self.rate * (node - self.count // 2))
+        high = self.scale * xp.sinh(self.rate * (node + 1 - self.count // 2))
+        return node.astype(xp.int32), xp.clip((angle - low) / (high - low), 0.0, 1.0)
+
+
+class Place(NamedTuple):
+    """Where states z lie.
+
+    `height` a (m), below 0 in the capture set; the cell's nodes are `node`, `node` + 1, and `stride` further
+    on the same two, the weights of the upper ones `along` and `up`. A direction phi of the pursuer's frame is
+    `sign` phi + `turns` pi in that of the table.
+    """
+
+    height: Any
+    node: Any
+    stride: Any
+    up: Any
+    along: Any
+    sign: Any
+    turns: Any
+
+    def corners(self, xp: Any) -> tuple[Any, Any]:
+        """Nodes and weights of the cell's corners, (..., 4)."""
+        up, along = self.up, self.along
+        node = [self.node, self.node + 1, self.node + self.stride, self.node + self.stride + 1]
+        weight = [(1.0 - up) * (1.0 - along), (1.0 - up) * along, up * (1.0 - along), up * along]
+        return xp.stack(node, -1), xp.stack(weight, -1)
+
+
+class Grid(NamedTuple):
+    """The nodes of a table, in SI units.
+
+    `capture_distance` l, `angle` S'; spacings of `heights` (a, and b in the open region), of `shares` of the
+    straight part, from its end at b = 0 (0) to the arc (1); `bearings` cells on the arc; `gap`, how far below
+    0 the committed region's first node has its b.
+    """
+
+    capture_distance: float
+    angle: float
+    heights: Spacing
+    shares: Spacing
+    bearings: int
+    gap: float
+
+    @property
+    def committed(self) -> int:
+        """Nodes of the committed region at each height."""
+        return self.shares.count + self.bearings
+
+    @property
+    def first_committed(self) -> int:
+        """Number of the first node of the committed region."""
+        return self.heights.count**2
+
+    @property
+    def size(self) -> int:
+        """Nodes in both regions."""
+        return self.first_committed + self.heights.count * self.committed
+
+    @property
+    def points(self) -> Float[np.ndarray, "n 2"]:
+        """z at every node, m."""
+        cosine, sine = math.cos(self.angle), math.sin(self.angle)
+        heights = self.heights.nodes
+        left, right = np.meshgrid(heights, heights, indexing="ij")
+        height, share = np.meshgrid(heights, self.shares.nodes, indexing="ij")
+        other = -self.gap - share * self._straight(np, height)
+        arc = np.linspace(self.angle, math.pi / 2.0, self.bearings + 1)[1:]
+        distance, bearing = np.meshgrid(self.capture_distance + heights, arc, indexing="ij")
+
+        def meeting(a: Reals, b: Reals) -> Reals:
+            ahead = (a + b + 2.0 * self.capture_distance) / (2.0 * cosine)
+            return np.stack([ahead, (a - b) / (2.0 * sine)], -1)
+
+        round_ = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], -1)
+        edge = np.concatenate([meeting(height, other), round_], 1)
+        return np.concatenate([meeting(left, right).reshape(-1, 2), edge.reshape(-1, 2)])
+
+    def _straight(self, xp: Any, height: Any) -> Any:
+        """How far b falls along the straight part at this height, m."""
+        level = self.capture_distance
+        return level - (level + xp.maximum(height, 0.0)) * math.cos(2.0 * self.angle) - self.gap
+
+    def place(self, xp: Any, ahead: Any, left: Any) -> Place:
+        """Where states z = (ahead, left) (m) lie; `xp` is `numpy` or `jax.numpy`.
+
+        Beyond the largest height the outermost nodes count.
+        """
+        level, cosine, sine = self.capture_distance, math.cos(self.angle), math.sin(self.angle)
+        behind, right = ahead < 0.0, left < 0.0
+        x, y = xp.abs(ahead), xp.abs(left)
+        # Reversing the pursuer makes phi to pi - phi, the mirror then to -phi.
+        sign = xp.where(behind == right, 1.0, -1.0)
+        turns = xp.where(behind, xp.where(right, -1.0, 1.0), 0.0)
+        arc = y * cosine >= x * sine
+        distance = xp.sqrt(x * x + y * y)
+        height = xp.where(arc, distance, x * cosine + y * sine) - level
+        other = x * cosine - y * sine - level
+        is_open = ~arc & (other >= 0.0)
+        cell, up = self.heights.place(xp, height)
+        beside, beside_along = self.heights.place(xp, other)
+        share, share_along = self.shares.place(xp, (-self.gap - other) / self._straight(xp, height))
+        turned = (xp.arctan2(y, x) - self.angle) / (math.pi / 2.0 - self.angle) * self.bearings
+        bearing = xp.clip(xp.floor(turned), 0, self.bearings - 1)
+        column = xp.where(arc, self.shares.count - 1 + bearing.astype(xp.int32), share)
+        along = xp.where(arc, xp.clip(turned - bearing, 0.0, 1.0), share_along)
+        count = self.heights.count
+        return Place(
+            height,
+            xp.where(is_open, cell * count + beside, self.first_committed + cell * self.committed + column),
+            xp.where(is_open, count, self.committed),
+            up,
+            xp.where(is_open, beside_along, along),
+            sign,
+            turns,
+        )

@@ -1,0 +1,252 @@
+"""The clearance table: how far away must an obstacle be for the evader to stay free of it and the pursuer?"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sidestep import _interrupts
+from sidestep._arrays import AnyArray, Scalar
+from sidestep._compiled import cache_folder
+from sidestep.safety.clearance.game import ClearanceGame
+from sidestep.safety.clearance.grid import Angles, Grid, Spacing
+from sidestep.safety.clearance.solve import Resolution, Solution, solve
+from sidestep.store.files import write_bytes
+
+_FORMAT = 1
+_SAVE_SECONDS = 20.0
+
+
+class ClearanceTable(eqx.Module):
+    """How far away an obstacle must be, R, for the evader to stay free of it and of the pursuer.
+
+    With z the evader in the pursuer's frame, beta its angle to the pursuer's axis, and p from the obstacle to
+    the evader in the same frame, the evader can stay free where
+
+        h'(z) >= 0  and  |p| >= R(z, direction of p),     h'(z) = |z| cos((S' - beta)+) - l.
+
+    The table is the fixed point of the game in which the evader holds each velocity for a period, solved on a
+    grid: it is computed, not proved (see `docs/theory.md`). R is interpolated between the nodes, never across
+    the surfaces at which the evader loses the choice of a side.
+
+    **Attributes:** `clearance` (nodes, angles) m; `ridge` (nodes,) rad, from which the angles of a row count;
+    `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed point, `change` the largest
+    in the last of them, m.
+    """
+
+    clearance: Float[Array, "n k"]
+    ridge: Float[Array, "n"]
+    game: ClearanceGame = eqx.field(static=True)
+    grid: Grid = eqx.field(static=True)
+    directions: Angles = eqx.field(static=True)
+    sweeps: int = eqx.field(static=True)
+    change: float = eqx.field(static=True)
+
+    @staticmethod
+    def of(game: ClearanceGame, solution: Solution) -> ClearanceTable:
+        """The table of a solution."""
+        return ClearanceTable(
+            jnp.asarray(solution.clearance),
+            jnp.asarray(solution.ridge, jnp.float32),
+            game,
+            solution.grid,
+            solution.directions,
+            solution.sweeps,
+            solution.change,
+        )
+
+    def __call__(self, z: Float[AnyArray, "2"], offset: Float[AnyArray, "2"]) -> tuple[Scalar, Scalar]:
+        """h' and R, m, for z (m) and an obstacle in the direction of -`offset`, p = `offset` (m).
+
+        Piecewise smooth: derivatives are those of the cell that the state lies in. In the capture set R is
+        that at its edge.
+        """
+        place = self.grid.place(jnp, z[0], z[1])
+        node, weight = place.corners(jnp)
+        direction = jnp.arctan2(offset[1], offset[0])
+        turned = place.sign * direction + math.pi * place.turns - jnp.sum(weight * self.ridge[node])
+        angle, along = self.directions.place(jnp, turned)
+        after = jnp.where(angle + 1 < self.directions.count, angle + 1, 0)
+        row = (1.0 - along) * self.clearance[node, angle] + along * self.clearance[node, after]
+        return place.height, jnp.sum(weight * row)
+
+    def margin(
+        self,
+        z: Float[AnyArray, "2"],
+        offset: Float[AnyArray, "2"],
+        drift: Float[AnyArray, ""] | float = 0.0,
+    ) -> Scalar:
+        """min(h', |p| - R), m: at least 0 in the set that the evader keeps; with |p| less by `drift` (m)."""
+        height, clearance = self(z, offset)
+        return jnp.minimum(height, jnp.hypot(offset[0], offset[1]) - drift - clearance)
+
+    def margin_after(
+        self,
+        z: Float[AnyArray, "2"],
+        offset: Float[AnyArray, "2"],
+        move: Float[AnyArray, "2"],
+        poses: Float[AnyArray, "n 3"],
+        drift: Float[AnyArray, ""] | float,
+    ) -> Scalar:
+        """The least `margin` (m) after a period, in the pursuer's frame at its beginning.
+
+        **Arguments:** the evader moves by `move` (m), the pursuer to any of `poses` (m, m, rad), the obstacle
+        by up to `drift` (m) in any direction.
+        """
+        place, moved = z + move, offset + move
+
+        def after(pose: Float[AnyArray, "3"]) -> Scalar:
+            cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+
+            def seen(x: Scalar, y: Scalar) -> Float[Array, "2"]:
+                return jnp.stack([cosine * x + sine * y, cosine * y - sine * x])
+
+            return self.margin(seen(*(place - pose[:2])), seen(*moved), drift)
+
+        return jnp.min(jax.vmap(after)(poses))
+
+    @property
+    def farthest(self) -> float:
+        """The largest R, m: obstacles beyond do not matter from any z with h' >= 0."""
+        return float(jnp.max(self.clearance))
+
+    def save(self, path: str | Path) -> None:
+        """Write the table to a file. **Raises** `OutputError` where that cannot be written."""
+        about = {
+            "format": _FORMAT,
+            "game": self.game.as_dict,
+            "grid": _plain(self.grid),
+            "directions": _plain(self.directions),
+            "sweeps": self.sweeps,
+            "change": self.change,
+        }
+        content = io.BytesIO()
+        np.savez_compressed(
+            content,
+            about=np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8),
+            clearance=np.asarray(self.clearance),
+            ridge=np.asarray(self.ridge),
+        )
+        write_bytes(path, content.getvalue())
+
+    @staticmethod
+    def load(path: str | Path) -> ClearanceTable:
+        """The table of a file. **Raises** `ValueError` where there is none that this version reads."""
+        try:
+            with np.load(path) as file:
+                about = json.loads(file["about"].tobytes())
+                if about["format"] != _FORMAT:
+                    raise ValueError(f"format {about['format']}, not {_FORMAT}")
+                return ClearanceTable(
+                    jnp.asarray(file["clearance"]),
+                    jnp.asarray(file["ridge"]),
+                    ClearanceGame(**about["game"]),
+                    _grid(about["grid"]),
+                    Angles(*about["directions"]),
+                    about["sweeps"],
+                    about["change"],
+                )
+        except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+            raise ValueError(f"{path} is no clearance table of this version of sidestep ({error})") from None
+
+
+def clearance_table(
+    game: ClearanceGame,
+    resolution: Resolution | None = None,
+    *,
+    periods: int | None = None,
+    progress: Callable[[Solution], None] | None = None,
+) -> ClearanceTable:
+    """The table of a game: the one kept from an earlier time, or solved for, which takes minutes.
+
+    It is kept in the user's cache folder (see `cache_folder`) under its parameters. So is a solution on the
+    way, every 20 s and when Ctrl-C ends it: the next call goes on from there.
+
+    **Arguments** and **raises** as `solve`.
+    """
+    resolution = Resolution() if resolution is None else resolution
+    asked = {"format": _FORMAT, "game": game.as_dict, "resolution": asdict(resolution), "periods": periods}
+    key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:20]
+    folder = cache_folder()
+    kept = None if folder is None else folder / "clearance" / f"{key}.npz"
+    if kept is None:
+        return ClearanceTable.of(game, solve(game, resolution, periods=periods, progress=progress))
+    if kept.exists():
+        with suppress(ValueError):
+            return ClearanceTable.load(kept)
+    on_the_way = kept.with_name(f"{key}.part.npz")
+    saved, latest = time.monotonic(), None
+
+    def after(solution: Solution) -> None:
+        nonlocal saved, latest
+        latest = solution
+        if time.monotonic() - saved > _SAVE_SECONDS:
+            _write_part(on_the_way, solution)
+            saved = time.monotonic()
+        if progress is not None:
+            progress(solution)
+        _interrupts.check()
+
+    try:
+        with _interrupts.held():
+            begun = _read_part(on_the_way)
+            solution = solve(game, resolution, periods=periods, begun=begun, progress=after)
+    except KeyboardInterrupt:
+        if latest is not None:
+            _write_part(on_the_way, latest)
+        raise
+    table = ClearanceTable.of(game, solution)
+    table.save(kept)
+    on_the_way.unlink(missing_ok=True)
+    return table
+
+
+def _write_part(path: Path, solution: Solution) -> None:
+    content = io.BytesIO()
+    where = {"grid": _plain(solution.grid), "directions": _plain(solution.directions)}
+    where |= {"stage": solution.stage, "sweeps": solution.sweeps, "change": solution.change}
+    about = np.frombuffer(json.dumps(where).encode(), np.uint8)
+    np.savez(content, about=about, clearance=solution.clearance, ridge=solution.ridge)
+    write_bytes(path, content.getvalue())
+
+
+def _read_part(path: Path) -> Solution | None:
+    """A solution on the way, None where there is none that can be read."""
+    try:
+        with np.load(path) as file:
+            about = json.loads(file["about"].tobytes())
+            return Solution(
+                _grid(about["grid"]),
+                Angles(*about["directions"]),
+                file["ridge"],
+                file["clearance"],
+                about["stage"],
+                about["sweeps"],
+                about["change"],
+            )
+    except (OSError, ValueError, KeyError, TypeError, EOFError):
+        return None
+
+
+def _plain(part: Any) -> Any:
+    """A tuple of numbers and tuples, as lists."""
+    return [_plain(entry) for entry in part] if isinstance(part, tuple) else part
+
+
+def _grid(values: list[Any]) -> Grid:
+    distance, angle, heights, shares, bearings, gap = values
+    return Grid(distance, angle, Spacing(*heights), Spacing(*shares), bearings, gap)
