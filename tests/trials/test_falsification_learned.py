@@ -11,7 +11,13 @@ from sidestep.safety import make_shield
 from sidestep.store.checkpoints import read_named
 from sidestep.trials.falsification import Plan, falsify
 from sidestep.trials.falsification.chases import Target
-from sidestep.trials.falsification.learned import OBSERVATIONS, Lessons, lesson, look, new_pupil
+from sidestep.trials.falsification.learned import (
+    OBSERVATIONS,
+    PursuerTraining,
+    attacker_observation,
+    train,
+    untrained,
+)
 from sidestep.trials.falsification.starts import draw_starts
 from sidestep.world import World, goal_seeking, load_scenario
 
@@ -23,18 +29,18 @@ UNSHIELDED = Target(EMPTY, goal_seeking, make_shield("none", EMPTY))
 @pytest.mark.slow
 def test_learning_pursuer_learns_from_every_period_that_counts():
     algorithm = TD3(hidden=(8, 8))
-    lessons = Lessons(
+    training = PursuerTraining(
         algorithm, chases=4, decisions=6, decision_steps=2, updates=2, batch_size=8, capacity=50
     )
-    pupil = new_pupil(lessons, jax.random.key(0))
+    state = untrained(training, jax.random.key(0))
     starts = draw_starts(EMPTY, jax.random.split(jax.random.key(1), 4), np.array([True, True, False, False]))
-    taught, chases, wheels = lesson(UNSHIELDED, lessons, pupil, starts, "capture", jax.random.key(2))
+    trained, chases, wheels = train(UNSHIELDED, training, state, starts, "capture", jax.random.key(2))
     steps = np.asarray(chases.tally.steps)
     assert wheels.shape == (4, 12, 1, 2)
-    assert int(taught.ring.written) == np.sum(-(-steps // 2))
-    assert int(taught.learner.updates) > 0
-    filled = int(min(taught.ring.written, 50))
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:filled], taught.ring.rows)
+    assert int(trained.ring.written) == np.sum(-(-steps // 2))
+    assert int(trained.learner.updates) > 0
+    filled = int(min(trained.ring.written, 50))
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:filled], trained.ring.rows)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(rows))
     # Only a loss pays the bonus, and it ends the episode.
     assert np.sum(rows.reward > 5.0) == np.sum(np.asarray(chases.outcome) == 0)
@@ -51,9 +57,9 @@ def test_pursuer_sees_the_same_in_a_turned_world():
         obstacles=jnp.concatenate([start.obstacles[:, :2] @ turn.T, start.obstacles[:, 2:] @ turn.T], -1),
         target=turn @ start.target,
     )
-    seen = look(PAPER, start)
+    seen = attacker_observation(PAPER, start)
     assert seen.shape == (OBSERVATIONS,)
-    assert np.allclose(seen, look(PAPER, turned), atol=1e-5)
+    assert np.allclose(seen, attacker_observation(PAPER, turned), atol=1e-5)
     assert np.max(np.abs(seen)) <= 1.0 + 1e-6
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import whole_number
-from sidestep.loop import crew, episode_key, rollout
+from sidestep.loop import batch, episode_key, rollout
 from sidestep.store.runs import OUTCOMES
 from sidestep.trials import Evaluation, evaluate, monte_carlo
 from sidestep.world import goal_seeking, load_scenario
@@ -68,10 +68,10 @@ def test_results_do_not_depend_on_the_number_of_threads(scenario, monkeypatch):
     run = lambda **more: evaluate(  # noqa: E731
         scenario, "goal-seeking", "paper", "random", 101, 7, mapped=True, **more
     )
-    compiled = crew._advance._cached._cache_size()  # pyright: ignore
+    compiled = batch._advance._cached._cache_size()  # pyright: ignore
     shared, alone = run(batch=96), run(batch=32, threads=1)
     # All threads, and the one alone, have the same width.
-    assert crew._advance._cached._cache_size() == compiled + 1  # pyright: ignore
+    assert batch._advance._cached._cache_size() == compiled + 1  # pyright: ignore
     for name in ("outcome", "returns", "steps", "min_pursuer_clearance", "interventions", "max_correction"):
         assert np.array_equal(getattr(shared, name), getattr(alone, name)), name
     assert shared.map is not None
@@ -96,10 +96,10 @@ def test_code_on_the_host_is_asked_by_one_thread(host, monkeypatch):
 
 
 def test_another_scenario_value_does_not_compile_again(evaluation, scenario):
-    before = crew._advance._cached._cache_size()  # pyright: ignore
+    before = batch._advance._cached._cache_size()  # pyright: ignore
     faster = load_scenario("paper", **{**SETTING, "arena_side": 2.5, "pursuer_speed": 0.3})
     result = evaluate(faster, "goal-seeking", "none", "turn-then-drive", 33, 8, batch=32)
-    assert crew._advance._cached._cache_size() == before  # pyright: ignore
+    assert batch._advance._cached._cache_size() == before  # pyright: ignore
     assert result.episodes == 33
 
 

@@ -1,4 +1,4 @@
-"""How does an episode run? One control period, one episode, policies, random keys, recordings."""
+"""Run episodes: control step, episode, policies, random keys, recordings."""
 
 from sidestep.loop.episode import Episode, Period, Tally, Task, advance, ask, begin, hold
 from sidestep.loop.keys import episode_key

@@ -1,8 +1,8 @@
-"""One episode: control period after control period, summed up in one tally, until it ends.
+"""One episode: control periods until it ends, with a tally of them.
 
-Every loop of the package goes through `advance`: training, batch evaluation, recorded episodes, the
-falsifier's chases and the environments of `bridges.gym`. They differ in who chooses the nominal action, in
-the random keys and in what they read of each period.
+All loops of the package call `advance`: training, batch evaluation, recorded episodes, the falsifier's chases
+and the environments of `bridges.gym`. They differ in the source of the nominal action, in the random keys and
+in what they read of each period.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from sidestep.world import Events, Scenario, World
 
 
 class Task(eqx.Module):
-    """What is run: a `policy` behind its `shield`, hunted by a `pursuer`, in a `scenario`.
+    """What is run: a `policy` behind its `shield` against a `pursuer` in a `scenario`.
 
-    `policy(observation) -> action in [-1, 1]^2` is asked every `decision_steps` control periods; None where
-    the caller chooses the nominal action. `pursuer(scenario, world, key) -> wheel speeds (2,)` in m/s.
+    `policy(observation) -> action in [-1, 1]^2` decides every `decision_steps` control periods; None if the
+    caller chooses the nominal action. `pursuer(scenario, world, key) -> wheel speeds (2,)` in m/s.
     """
 
     scenario: Scenario
@@ -41,12 +41,12 @@ class Task(eqx.Module):
 
 
 class Tally(eqx.Module):
-    """What an episode has come to so far.
+    """Sums over an episode so far.
 
-    **Attributes:** `total_reward`; `steps` control periods; the least clearances of all periods (m); how many
-    periods the shield corrected (`interventions`), could not satisfy its rows in (`infeasible`), was given
-    numbers that are not finite in (`invalid`); in how many a pursuer's wheel speeds were not finite
-    (`pursuer_invalid`); the sum and the maximum of |action - nominal| (m/s).
+    **Attributes:** `total_reward`; `steps`, control periods; the least clearances (m); the number of periods
+    in which the shield corrected the action (`interventions`), could not satisfy its rows (`infeasible`), got
+    non-finite input (`invalid`), and in which a pursuer's wheel speeds were not finite (`pursuer_invalid`);
+    the sum and the maximum of |action - nominal| (m/s).
     """
 
     total_reward: Lanes
@@ -62,13 +62,13 @@ class Tally(eqx.Module):
 
     @classmethod
     def zero(cls, world: World) -> Tally:
-        """Before the first period, for one world or for each of many in lanes."""
+        """The tally before the first period, for one world or for many in lanes."""
         zero = jnp.zeros_like(world.time)
         count, far = jnp.zeros_like(world.time, jnp.int32), jnp.full_like(zero, jnp.inf)
         return cls(zero, count, far, far, count, count, count, count, zero, zero)
 
     def add(self, events: Events, result: ShieldResult, wheel_speeds: Float[Array, "m 2 *lanes"]) -> Tally:
-        """One period more."""
+        """The tally with one more period."""
         count = lambda flags: flags.astype(jnp.int32)  # noqa: E731
         return Tally(
             total_reward=self.total_reward + events.reward,
@@ -85,10 +85,10 @@ class Tally(eqx.Module):
 
 
 class Episode(eqx.Module):
-    """An episode that is running, or has ended: then nothing changes any more.
+    """The state of an episode. Once it has ended, it does not change.
 
-    **Attributes:** `world`; the shield's `memory`; the `nominal` velocity (m/s, world axes) that is held
-    until the next decision; `outcome` `RUNNING` or an index into `store.runs.OUTCOMES`; the `tally`.
+    **Attributes:** `world`; the shield's `memory`; the `nominal` velocity (m/s, world axes), held until the
+    next decision; `outcome`, `RUNNING` or an index into `store.runs.OUTCOMES`; the `tally`.
     """
 
     world: World
@@ -104,11 +104,11 @@ class Episode(eqx.Module):
 
 
 class Period(NamedTuple):
-    """What one control period brought, for callers to read.
+    """The data of one control period, for callers to read.
 
-    `world` and `after` at its beginning and end; `nominal` velocity (m/s); the `ShieldResult`; the
-    `wheel_speeds (m, 2)` in m/s that the pursuers asked for; the `Events`. Where the episode was not
-    `running` before it, none of this happened.
+    `world` at its beginning and `after` at its end; `nominal` velocity (m/s); the `ShieldResult`; the
+    pursuers' commanded `wheel_speeds (m, 2)` in m/s; the `Events`. Not valid where the episode was not
+    `running` at its beginning.
     """
 
     world: World
@@ -121,7 +121,7 @@ class Period(NamedTuple):
 
 
 def begin(shield: Any, world: World) -> Episode:
-    """The episode that starts in `world`, or in each of many worlds in lanes."""
+    """Start an episode in `world`, or in each of many worlds in lanes."""
     return continued(world, start_in_lanes(shield, world))
 
 
@@ -137,26 +137,26 @@ def continued(world: World, memory: Any) -> Episode:
 
 
 def hold(episode: Episode, nominal: Float[AnyArray, "2 *lanes"]) -> Episode:
-    """The same episode with another nominal velocity (m/s, world axes) to hold."""
+    """The episode with a new nominal velocity (m/s, world axes)."""
     return eqx.tree_at(lambda episode: episode.nominal, episode, nominal)
 
 
 def ask(task: Task, episode: Episode) -> Episode:
-    """The same episode with the nominal velocity that the policy now decides on."""
+    """The episode with a new nominal velocity, from the policy."""
     assert task.policy is not None
     return hold(episode, decide(task.scenario, task.policy, episode.world))
 
 
 def ask_in_time(task: Task, episode: Episode, count: Int[Array, ""]) -> Episode:
-    """`ask` if a decision is due after `count` control periods, of this episode or of all in lanes."""
+    """`ask` if a decision is due after `count` control periods, for one episode or for all lanes."""
     due = count % task.decision_steps == 0
     return hold(episode, jax.lax.cond(due, lambda: ask(task, episode).nominal, lambda: episode.nominal))
 
 
 def advance(task: Task, episode: Episode, key: Any) -> tuple[Episode, Period]:
-    """One control period with the nominal velocity that the episode holds.
+    """Advance by one control period with the episode's nominal velocity.
 
-    One episode, or many in lanes (see `control_step`); then `key` has one entry for each as well.
+    For one episode, or many in lanes (see `control_step`); then `key` has one entry per lane.
     """
     running = episode.running
     world, memory, events, result, wheel_speeds = control_step(

@@ -1,4 +1,4 @@
-"""Anyone's policy, written with JAX or not, as something a compiled trial can call."""
+"""Custom policies, written with JAX or not, as functions that JAX can trace."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _WRONG_SHAPE = "a policy must answer one observation with an action of shape (2,
 
 @final
 class HostPolicy(eqx.Module):
-    """A policy that needs concrete numbers (NumPy, PyTorch, Python's `if`), asked on the host.
+    """A policy that needs concrete numbers (NumPy, PyTorch, Python's `if`) and runs on the host.
 
-    It works under `jit` and `vmap`, one observation at a time, each a fresh NumPy array of floats.
+    Under `jit` and `vmap` it is called with one observation at a time, a new NumPy array of floats.
     """
 
     policy: Callable[..., Any] = eqx.field(static=True)
@@ -55,12 +55,12 @@ def _host_action(policy: Callable[..., Any], observation: np.ndarray) -> np.ndar
 def as_policy(policy: Any, scenario: Scenario) -> Callable[..., Any]:
     """A policy `(observation) -> action in [-1, 1]^2` that JAX can trace.
 
-    **Arguments:** `policy` the name `goal-seeking` or any callable. One that JAX cannot trace, or that
-    answers with something other than a JAX array when traced (so that NumPy's random numbers, say, would be
-    drawn only once), is asked on the host: right, but slower.
+    **Arguments:** `policy` the name `goal-seeking` or any callable. A callable that JAX cannot trace runs on
+    the host, which is slower. So does one that returns something other than a JAX array when traced, because
+    its NumPy random numbers, for example, would be drawn only once.
 
-    **Raises** `TypeError` for what cannot be called, `ValueError` for an unknown name or an answer that is
-    not two real numbers, and whatever the policy itself raises.
+    **Raises** `TypeError` for an object that is not callable, `ValueError` for an unknown name or an answer
+    that is not two real numbers, and whatever the policy raises.
     """
     if isinstance(policy, str):
         if policy != GOAL_SEEKING:
@@ -80,7 +80,8 @@ def as_policy(policy: Any, scenario: Scenario) -> Callable[..., Any]:
 
 
 def _traced_answer(policy: Callable[..., Any], observation: Float[Array, "observation"]) -> Any:
-    """Shape and type of the policy's answer under tracing; None when it cannot be traced or ignores it."""
+    """Shape and dtype of the policy's answer under tracing; None if it cannot be traced, or its answer does
+    not depend on tracing."""
     traced = False
 
     def probe(observation: Array) -> Any:
@@ -93,6 +94,6 @@ def _traced_answer(policy: Callable[..., Any], observation: Float[Array, "observ
     try:
         answer = jax.eval_shape(probe, observation)
     except Exception:
-        # Whatever went wrong goes wrong again, in the open, when the host asks the policy.
+        # An error of the policy is raised again when it runs on the host.
         return None
     return answer if traced else None

@@ -1,4 +1,4 @@
-"""One episode, recorded period by period."""
+"""Record one episode period by period."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _TOLD = "told"
 class Trajectory(eqx.Module):
     """One episode of T control periods. Period t begins in world t and ends in world t + 1.
 
-    **Attributes:** `worlds` with a leading axis of T + 1; the rest with one of T: `nominal` and `action`
-    velocities (m/s, world axes), `wheel_speeds` (m, 2) m/s as the pursuers asked for them (they stood still
-    where these are not finite), `status` (see `Status`), `barriers` (m + k) in m, `slack` and `intervention`
-    in m/s, `events`.
+    **Attributes:** `worlds` with a leading axis of T + 1. All others have one of T: `nominal` and `action`
+    velocities (m/s, world axes), the pursuers' commanded `wheel_speeds` (m, 2) in m/s (a pursuer stands still
+    if they are not finite), `status` (see `Status`), `barriers` (m + k) in m, `slack` and `intervention` in
+    m/s, `events`.
     """
 
     worlds: World
@@ -57,19 +57,19 @@ class Trajectory(eqx.Module):
 
     @property
     def pursuer_invalid(self) -> int:
-        """Control periods in which a pursuer answered with wheel speeds that are not finite."""
+        """Number of control periods in which a pursuer's wheel speeds were not finite."""
         return int(np.sum(~np.all(np.isfinite(self.wheel_speeds), axis=(-2, -1))))
 
     @property
     def outcome(self) -> str:
-        """How the episode ended (see `OUTCOMES`); `cut` when it was recorded no further."""
+        """How the episode ended (see `OUTCOMES`); `cut` if the recording ended earlier."""
         index = int(outcome_of(jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), self.events)))
         return "cut" if index == RUNNING else OUTCOMES[index]
 
 
 @eqx.filter_jit
 def _record(task: Task, world: World, key: PRNGKeyArray, steps: int) -> tuple[Int[Array, ""], Trajectory]:
-    """Record until the episode ends, or for `steps` periods; what lies beyond the returned length is zero."""
+    """Record until the episode ends, or for `steps` periods; entries beyond the returned length are zero."""
 
     def period(count: Array, episode: Episode) -> tuple[Episode, Trajectory]:
         episode, period = advance(task, ask_in_time(task, episode, count), jax.random.fold_in(key, count))
@@ -119,10 +119,10 @@ def rollout(
 ) -> Trajectory:
     """Run one episode and record it.
 
-    With `episode_key(key, i)` it is episode i of `evaluate(..., key)` again.
+    With `episode_key(key, i)` it replays episode i of `evaluate(..., key)`.
 
-    **Arguments:** as for `evaluate`; `world` to start in, drawn from the scenario if not given; `steps` at
-    most this many control periods (the scenario's `episode_steps` if not given).
+    **Arguments:** as for `evaluate`; `world` to start in, by default drawn by the scenario; `steps` the
+    largest number of control periods (default: the scenario's `episode_steps`).
 
     **Raises** as `evaluate`.
     """
@@ -134,7 +134,7 @@ def rollout(
     world = _reset(scenario, start_key) if world is None else world
     count, record = _record(Task(scenario, policy, shield, pursuer), world, pursuit_key, steps)
     length = int(count)
-    # Cut on the host: JAX would compile one slice per leaf for every new length.
+    # Slice on the host: JAX would compile a program per leaf for every new length.
     cut = lambda leaf, end: jnp.asarray(np.asarray(leaf)[:end])  # noqa: E731
     worlds = jax.tree.map(lambda leaf: cut(leaf, length + 1), record.worlds)
     record = jax.tree.map(lambda leaf: cut(leaf, length), eqx.tree_at(lambda r: r.worlds, record, None))
@@ -148,7 +148,7 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Recording:
-    """A trajectory with the `scenario` it was recorded in (None: nobody said) and what else to say of it."""
+    """A trajectory with its `scenario` (None: unknown) and metadata `about` it."""
 
     trajectory: Trajectory
     scenario: Scenario | None
@@ -163,8 +163,8 @@ def save_trajectory(
 ) -> None:
     """Write a trajectory as a NumPy archive of plain arrays, whole or not at all.
 
-    **Arguments:** `scenario` it was recorded in, and what to say `about` it as JSON values by name, `shield`
-    among them; `load_episode` gives both back.
+    **Arguments:** `scenario` of the recording; `about`, metadata as JSON values by name, such as `shield`.
+    `load_episode` returns both.
     """
     buffer = BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(trajectory).items()}
@@ -176,7 +176,7 @@ def save_trajectory(
 
 
 def load_trajectory(path: str | Path) -> Trajectory:
-    """What `save_trajectory` wrote. **Raises** `ValueError` when the file is no such archive."""
+    """Read a file of `save_trajectory`. **Raises** `ValueError` when the file is no such archive."""
     return load_episode(path).trajectory
 
 
@@ -187,7 +187,7 @@ def _without_code(scenario: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load_episode(path: str | Path) -> Recording:
-    """What `save_trajectory` wrote, with what it was told. **Raises** as `load_trajectory`."""
+    """Read a file of `save_trajectory`, with its scenario and metadata. **Raises** as `load_trajectory`."""
     try:
         with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
             arrays = {name: jnp.asarray(archive[name]) for name in archive.files if name != _TOLD}
@@ -199,8 +199,8 @@ def load_episode(path: str | Path) -> Recording:
             events=Events(**{name.removeprefix("events."): values for name, values in events.items()}),
             **arrays,
         )
-        # Custom robots that have no name are code, and what was recorded needs none of it. Those with a name
-        # are kept: the sets that figures draw depend on them.
+        # Custom robots without a name are code, which a recording does not need. Robots with a name are kept,
+        # because the sets in figures depend on them.
         scenario = load_scenario("paper", **_without_code(told["scenario"])) if told else None
         return Recording(trajectory, scenario, told.get("about", {}))
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:

@@ -1,10 +1,10 @@
-"""One control period of everything: the way that simulation, training and evaluation all take.
+"""One control period. Simulation, training and evaluation all use it.
 
     world -> observation -> policy -> nominal velocity -> shield -> filtered action
                         pursuers -> wheel speeds --------> world one period later, events
 
-`decide` is the policy's part and runs every `decision_steps` periods (`decision_steps_of`), its nominal
-velocity being held in world axes in between; `control_step` is the rest and runs in every period.
+`decide` is the policy's part. It runs every `decision_steps` periods (`decision_steps_of`); in between, the
+nominal velocity is constant in world axes. `control_step` is the rest and runs in every period.
 """
 
 from collections.abc import Callable
@@ -36,11 +36,11 @@ def decision_steps_of(policy: object) -> int:
 RUNNING = -1
 """Outcome of an episode that has not ended."""
 CAPTURED, COLLIDED, REACHED, TIMED_OUT = range(4)
-"""Outcomes of one that has, as indices into `store.runs.OUTCOMES`."""
+"""Outcomes of an ended episode, as indices into `store.runs.OUTCOMES`."""
 
 
 def outcome_of(events: Events) -> Int[Array, "*lanes"]:
-    """Index into `records.OUTCOMES` of what ended the episode in this period, -1 if nothing did."""
+    """Index into `store.runs.OUTCOMES` of the event that ended the episode in this period, -1 for none."""
     outcome = jnp.full_like(events.captured, RUNNING, jnp.int32)
     flags = (events.captured, events.collided, events.reached, events.timed_out)
     for index in reversed(range(len(flags))):
@@ -49,11 +49,10 @@ def outcome_of(events: Events) -> Int[Array, "*lanes"]:
 
 
 def decide(scenario: Scenario, policy: Callable[..., Any], world: World) -> Float[Array, "2 *lanes"]:
-    """The nominal velocity (m/s, world axes) that `policy(observation)` asks for in `world`, or in each of
-    the worlds that it has in lanes.
+    """The nominal velocity (m/s, world axes) of `policy(observation)` in `world`, or in each world in lanes.
 
-    An action that is not finite gives a nominal velocity of NaN, so that the shield sees it and reports
-    invalid input; the physics alone would take it for a stop.
+    A non-finite action gives a nominal velocity of NaN, so that the shield reports invalid input. The physics
+    would take it for a stop.
 
     **Raises** `ValueError` when the policy's action does not have shape (2,).
     """
@@ -72,7 +71,7 @@ def decide(scenario: Scenario, policy: Callable[..., Any], world: World) -> Floa
 def nominal_velocity(
     scenario: Scenario, world: World, action: Float[AnyArray, "2 *lanes"]
 ) -> Float[Array, "2 *lanes"]:
-    """`to_velocity`, but NaN for an action that is not finite, which shields report as invalid input."""
+    """`to_velocity`, but NaN for a non-finite action, so that shields report invalid input."""
     finite = jnp.isfinite(action[0]) & jnp.isfinite(action[1])
     return jnp.where(finite, to_velocity(scenario, world, action), jnp.nan)
 
@@ -86,18 +85,18 @@ def control_step(
     nominal: Float[AnyArray, "2 *lanes"],
     key: Any,
 ) -> tuple[World, Any, Events, Any, Float[Array, "m 2 *lanes"]]:
-    """One control period: the shield corrects `nominal`, the pursuers answer, the physics moves.
+    """One control period: the shield filters `nominal`, the pursuers decide, the robots move.
 
-    Evader and pursuers act at once, on the same world: neither sees the other's new command.
+    Evader and pursuers decide simultaneously from the same world; neither knows the other's new command.
 
-    Many worlds may be stepped in lanes, with their axis behind all others; on a CPU that is several times
-    faster than `jax.vmap` over this function. Then `memory` and `key` have one entry for each as well.
+    Many worlds may be stepped in lanes, with their axis last; on a CPU this is several times faster than
+    `jax.vmap` over this function. Then `memory` and `key` have one entry per lane.
 
     **Arguments:** `shield(world, nominal, memory) -> (ShieldResult, memory)`;
     `pursuer(scenario, world, key) -> wheel speeds (2,)` in m/s; `nominal` velocity in m/s, world axes.
 
     **Returns** the world one period later, the shield's new memory, the `Events` of the period, the
-    `ShieldResult`, and the wheel speeds (m, 2) in m/s that the pursuers asked for, see `pursue`.
+    `ShieldResult`, and the pursuers' commanded wheel speeds (m, 2) in m/s, see `pursue`.
     """
     result, memory = filter_in_lanes(shield, world, nominal, memory)
     wheel_speeds = pursue(scenario, pursuer, world, key)

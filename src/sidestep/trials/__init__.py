@@ -1,4 +1,4 @@
-"""What was measured? Batch evaluation, statistics, falsification, campaigns."""
+"""Measurements: batch evaluation, statistics, reproduction, falsification, campaigns."""
 
 from sidestep._moved import moved_names
 from sidestep.trials.captures import Capture, count_causes, examine_captures, explain_capture

@@ -1,4 +1,5 @@
-"""How the paper's shield comes to lose: what its row expected of the pursuer, and what the pursuer did."""
+"""Explain captures under the paper's shield: the motion its row assumes of the pursuer, and the actual
+one."""
 
 from __future__ import annotations
 
@@ -15,21 +16,23 @@ from sidestep.trials.evaluation import Evaluation
 from sidestep.world import Scenario
 
 CAUSES = ("reversing", "head-on", "other")
-"""`reversing`: the pursuer drove backwards, which the row took for leaving. `head-on`: no velocity satisfied
-the row. `other`: neither, in the end."""
+"""`reversing`: the pursuer drove backwards, which the row takes for moving away. `head-on`: no velocity
+satisfied the row. `other`: neither."""
 
 _LAST_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
 class Capture:
-    """One capture, period by period, seen along the line from the pursuer to the evader.
+    """One capture, period by period, along the unit vector n from the pursuer to the evader.
 
-    All speeds are along n, the unit vector from the pursuer to the evader, in m/s: `expected` the least n.u
-    that the paper's row asks for, V n.(cos theta, sin theta) - gamma h, which takes the pursuer to drive
-    forwards; `needed` the least that its true speed v asks for, v n.(cos theta, sin theta) - gamma h; `moved`
-    the evader's n.u. `range_barrier` is h = |p_e - p_d| - l in m. `pursuer` is the one that caught it; from
-    `decisive_period` on it moved less than needed, to the end.
+    - `expected` m/s: the offset of the paper's row, V n.(cos theta, sin theta) - gamma h, which assumes that
+      the pursuer drives forwards at full speed
+    - `needed` m/s: the same with the pursuer's true speed v, v n.(cos theta, sin theta) - gamma h
+    - `moved` m/s: the evader's n.u
+    - `range_barrier` m: h = |p_e - p_d| - l
+    - `pursuer`: index of the capturing pursuer
+    - `decisive_period`: from this period to the end the evader moved less than needed
     """
 
     pursuer: int
@@ -43,7 +46,7 @@ class Capture:
 
 
 def explain_capture(scenario: Scenario, trajectory: Trajectory) -> Capture:
-    """What happened on the way to a capture. **Raises** `ValueError` when the episode did not end in one."""
+    """Explain the capture that ends an episode. **Raises** `ValueError` when it ended otherwise."""
     if trajectory.outcome != "captured":
         raise ValueError(f"the episode ended '{trajectory.outcome}', not in a capture")
     evader, pursuers = np.asarray(trajectory.worlds.evader), np.asarray(trajectory.worlds.pursuers)
@@ -71,7 +74,7 @@ def explain_capture(scenario: Scenario, trajectory: Trajectory) -> Capture:
 
 
 def count_causes(scenario: Scenario, trajectories: Sequence[Trajectory]) -> dict[str, int]:
-    """How many of these captures had which of `CAUSES`."""
+    """The number of these captures per cause, see `CAUSES`."""
     causes = [explain_capture(scenario, trajectory).cause for trajectory in trajectories]
     return {cause: causes.count(cause) for cause in CAUSES}
 
@@ -86,16 +89,16 @@ def examine_captures(
     *,
     most: int = 60,
 ) -> tuple[dict[str, int], Trajectory | None]:
-    """Run the captures of an evaluation again, at most the first `most`, and see how they came about.
+    """Replay the captures of an evaluation, at most the first `most`, and count their causes.
 
-    **Arguments:** those that `evaluate` was called with.
+    **Arguments:** those of the call of `evaluate`.
 
-    **Returns** how many had which of `CAUSES`, and one capture of the most frequent cause that took at least
-    three seconds if there is one (None without captures).
+    **Returns** the number of captures per cause, and an example of the most frequent cause, of at least 3 s
+    if there is one (None without captures).
     """
     numbers = evaluation.numbers_of("captured")[:most]
     found = [rollout(scenario, policy, shield, pursuer, episode_key(key, int(number))) for number in numbers]
-    # Rounding may differ between one episode and a batch, and an episode near the edge end otherwise.
+    # Rounding differs between a single episode and a batch, so a borderline episode may end differently.
     found = [trajectory for trajectory in found if trajectory.outcome == "captured"]
     counts = count_causes(scenario, found)
     if not found:

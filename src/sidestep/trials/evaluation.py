@@ -1,4 +1,4 @@
-"""What a batch of episodes came to: counts, rates with intervals, clearances, interventions."""
+"""Results of a batch of episodes: counts, rates with intervals, clearances, interventions."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Results of `evaluate`, one entry per episode, in the order of the episodes' numbers.
+    """Results of `evaluate`, one entry per episode, in order of the episode numbers.
 
-    **Attributes:** `outcome` indices into `OUTCOMES`; `returns` undiscounted; `steps` control periods;
-    `times` s; `min_pursuer_clearance` and `min_obstacle_clearance` m, infinite without such a robot;
-    `interventions`, `infeasible`, `invalid` control periods in which the shield did not answer with the
-    nominal action, could not satisfy its rows, was given numbers that are not finite; `mean_correction`
-    over all periods and `max_correction`, m/s; `map` where the shield stepped in, if it was asked for;
-    `pursuer_invalid` control periods in which a pursuer answered with wheel speeds that are not finite, and
-    stood still (None: recorded before they were counted).
+    - `outcome`: indices into `OUTCOMES`
+    - `returns`, undiscounted; `steps`, control periods; `times` s
+    - `min_pursuer_clearance` and `min_obstacle_clearance` m, infinite without such a robot
+    - `interventions`, `infeasible`, `invalid`: numbers of control periods in which the shield did not answer
+      with the nominal action, could not satisfy its rows, got non-finite input
+    - `mean_correction` over all periods and `max_correction`, m/s
+    - `map` of interventions, if requested
+    - `pursuer_invalid`: control periods in which a pursuer's wheel speeds were not finite and it stood still
+      (None: recorded by a version that did not count them)
     """
 
     outcome: Int[np.ndarray, "episodes"]
@@ -57,7 +59,7 @@ class Evaluation:
 
     @property
     def captured(self) -> int:
-        """Episodes that ended with a capture, whether or not it came with a collision."""
+        """Episodes that ended with a capture, with or without a collision in the same period."""
         return self._count("captured")
 
     @property
@@ -72,7 +74,7 @@ class Evaluation:
 
     @property
     def timed_out(self) -> int:
-        """Episodes cut by the time limit, with nothing else having happened."""
+        """Episodes ended by the time limit."""
         return self._count("timed_out")
 
     @property
@@ -101,14 +103,14 @@ class Evaluation:
 
     @property
     def invalid_rate(self) -> float:
-        """Share of control periods in which the policy asked for something that is not finite."""
+        """Share of control periods in which the shield got non-finite input."""
         return self._share(self.invalid)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values: counts, `X_rate` with its 95 % Wilson interval `X_rate_low`, `X_rate_high` for
-        X in captured, collided, reached, timed_out and safe, and what else the attributes sum up to.
+        """JSON values: counts, `X_rate` with its 95 % Wilson interval `X_rate_low`, `X_rate_high` for X in
+        captured, collided, reached, timed_out and safe, and summaries of the other attributes.
 
-        Clearances of robots that do not exist, and the median time of no episode, are null.
+        Clearances without such a robot, and the median time without an episode that reached, are null.
         """
         counts = {name: self._count(name) for name in OUTCOMES} | {"safe": self.safe}
         report: dict[str, Any] = {"episodes": self.episodes, **counts}
@@ -121,7 +123,7 @@ class Evaluation:
             }
 
         def quantiles(values: np.ndarray) -> dict[str, float]:
-            # Among infinite values (no such robot) interpolation would subtract infinities.
+            # Interpolation between infinite values (no such robot) would give NaN.
             if not np.all(np.isfinite(values)):
                 return {f"{q:g}": np.inf for q in _QUANTILES}
             return {

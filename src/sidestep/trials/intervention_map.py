@@ -1,4 +1,4 @@
-"""Where the shield stepped in: sums over control periods, by the evader's place as a pursuer sees it."""
+"""Maps of interventions: sums over control periods, by the evader's position in the pursuer's frame."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from sidestep.world import Scenario
 from sidestep.world.capture_geometry import to_pursuer_frame
 
 CELLS = 75
-"""Cells along each axis; odd, so that the axis of the pursuer, where much happens, has cells of its own."""
+"""Cells along each axis; odd, so that the pursuer's axis, where most interventions are, is inside cells."""
 _REACH = 2.5
 _NAMES = ("periods", "corrected", "infeasible", "correction", "ahead", "left")
 
 
 def map_reach(scenario: Scenario) -> Float[Array, ""]:
-    """How far (m) the map reaches ahead, behind, left and right of the pursuer: 2.5 capture distances."""
+    """Half the side length (m) of the map around the pursuer: 2.5 capture distances."""
     return jnp.asarray(_REACH * scenario.capture_distance)
 
 
 @dataclass(frozen=True)
 class InterventionMap:
-    """Sums over control periods in square cells of the reduced plane (x ahead of the pursuer, y left).
+    """Sums over control periods in square cells of the pursuer's frame (x ahead, y left).
 
-    Row i, column j is the cell with y from -reach + i w and x from -reach + j w on, w = 2 reach / cells.
+    Row i, column j is the cell of width w = 2 reach / cells whose least y is -reach + i w and least x is
+    -reach + j w.
 
-    **Attributes:** `reach` m; `periods` that began with the evader in the cell; `corrected` and `infeasible`
-    those of them in which the shield did not answer with the nominal action, could not satisfy its rows;
-    `correction` sum of |action - nominal|, `ahead` and `left` of its components in the pursuer's frame, m/s;
-    `outside` periods that began further off than the map reaches.
+    **Attributes:** `reach` m; `periods` that began with the evader in the cell; `corrected` and `infeasible`,
+    those in which the shield did not answer with the nominal action, could not satisfy its rows; sums of
+    |action - nominal| (`correction`) and of its components in the pursuer's frame (`ahead`, `left`), m/s;
+    `outside`, periods that began outside the map.
     """
 
     reach: float
@@ -49,7 +50,7 @@ class InterventionMap:
 
     @classmethod
     def of_sums(cls, reach: float, sums: Float[np.ndarray, "cells_and_one 6"]) -> InterventionMap:
-        """The map of what `add_periods` summed up, over as many calls as there were."""
+        """The map of the sums of `add_periods`."""
         inside = sums[:-1].reshape(CELLS, CELLS, len(_NAMES))
         parts: dict[str, Any] = {name: inside[..., index] for index, name in enumerate(_NAMES)}
         for name in ("periods", "corrected", "infeasible"):
@@ -57,7 +58,7 @@ class InterventionMap:
         return cls(reach, **parts, outside=round(float(sums[-1, 0])))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Plain arrays by name, as small as they go, for `from_arrays`."""
+        """Arrays by name, in the smallest dtypes, for `from_arrays`."""
         arrays: dict[str, np.ndarray] = {"reach": np.asarray(self.reach), "outside": np.asarray(self.outside)}
         for name in _NAMES:
             values = getattr(self, name)
@@ -66,12 +67,12 @@ class InterventionMap:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> InterventionMap:
-        """What `to_arrays` gave. **Raises** `KeyError` for a part that is missing."""
+        """The inverse of `to_arrays`. **Raises** `KeyError` for a missing part."""
         parts: dict[str, Any] = {name: np.asarray(arrays[name]) for name in _NAMES}
         return cls(float(arrays["reach"]), **parts, outside=int(arrays["outside"]))
 
     def __add__(self, other: InterventionMap) -> InterventionMap:
-        """Both together. **Raises** `ValueError` when they do not cover the same region."""
+        """The sum of two maps. **Raises** `ValueError` when they do not cover the same region."""
         if self.reach != other.reach or self.periods.shape != other.periods.shape:
             raise ValueError("these maps do not cover the same region")
         parts: dict[str, Any] = {name: getattr(self, name) + getattr(other, name) for name in _NAMES}
@@ -79,16 +80,16 @@ class InterventionMap:
 
 
 def no_periods() -> Float[Array, "cells_and_one 6"]:
-    """Sums before the first period. The last row takes what lies outside."""
+    """Zero sums. The last row is for periods outside the map."""
     return jnp.zeros((CELLS * CELLS + 1, len(_NAMES)))
 
 
 def add_periods(
     sums: Float[Array, "cells_and_one 6"], scenario: Scenario, period: Period
 ) -> Float[Array, "cells_and_one 6"]:
-    """Count one control period of each lane that is running: what `loop.crew` reads. To be traced.
+    """Add one control period of each running lane: a `Read` of `loop.batch`, to be traced.
 
-    Single precision holds counts up to 2^24: take the sums out before that many periods.
+    float32 holds counts up to 2^24, so the caller must take the sums out earlier.
     """
     world, nominal, result, running = period.world, period.nominal, period.result, period.running
     offsets = world.pursuers[:, :2] - world.evader

@@ -1,4 +1,4 @@
-"""Batched Monte Carlo: many episodes of any policy, shield and pursuer at once."""
+"""Batched Monte Carlo: many episodes of any policy, shield and pursuer in parallel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import PRNGKeyArray
 
 from sidestep._arrays import whole_number
 from sidestep._threads import side_by_side, useful_threads
-from sidestep.loop.crew import Crew, Trial
+from sidestep.loop.batch import EpisodeBatch, Trial
 from sidestep.loop.episode import Task
 from sidestep.loop.keys import as_key
 from sidestep.loop.policies import HostPolicy, as_policy
@@ -24,7 +24,7 @@ from sidestep.trials.intervention_map import InterventionMap, add_periods, map_r
 from sidestep.world import Scenario
 
 _WHOLE = 16
-"""Lanes that every instruction set's vectors divide; others are computed one by one."""
+"""The number of lanes should be a multiple of this; the CPU computes remaining lanes one by one."""
 _LEAST_WIDTH = 2 * _WHOLE
 
 
@@ -41,57 +41,58 @@ def evaluate(
     mapped: bool = False,
     threads: int | None = None,
 ) -> Evaluation:
-    """Run `episodes` independent episodes to their ends and report what happened.
+    """Run `episodes` independent episodes to their ends and return their results.
 
-    Episode i draws all its random numbers from `fold_in(key, i)`: neither `batch`, `threads` nor the number
-    of episodes changes them (rounding may differ in the last digit between batch sizes).
+    Episode i draws its random numbers from `fold_in(key, i)`. They do not depend on `batch`, `threads` or the
+    number of episodes; rounding may differ between batch sizes.
 
     **Arguments:**
 
-    - `policy` any `(observation) -> action in [-1, 1]^2`, in JAX or not, or `"goal-seeking"`; asked every
-      `policy.decision_steps` control periods (1 if it has none)
+    - `policy` any `(observation) -> action in [-1, 1]^2`, in JAX or not, or `"goal-seeking"`; it decides
+      every `policy.decision_steps` control periods (1 if it has no such attribute)
     - `shield` a name or a `Shield`; `pursuer` a name, a `Pursuer` or a callable
       `(scenario, world, key) -> wheel speeds (2,)`
     - `key` a random key or a seed
-    - `batch` episodes that run at once; `progress(finished, episodes)` is called between chunks
-    - `mapped` whether to sum up where the shield stepped in, as `Evaluation.map`
-    - `threads` at most so many share the episodes, each with its part of `batch`; as many as there are cores
-      if not given. One where an accelerator computes, or a policy or pursuer runs on the host
+    - `batch` episodes run at once; `progress(finished, episodes)` is called between chunks
+    - `mapped` whether to map the interventions, as `Evaluation.map`
+    - `threads` the largest number of threads, which share `batch`; by default the number of cores. Always one
+      on an accelerator, or if policy or pursuer runs on the host
 
-    **Raises** `ValueError` for a number that is not positive, for an unknown name and for an answer of the
-    wrong shape. An action that is not finite is passed on to the shield and counted as `invalid`;
-    a pursuer whose wheel speeds are not finite stands still, which is counted as `pursuer_invalid`.
+    **Raises** `ValueError` for a number that is not positive, an unknown name, and an answer of the wrong
+    shape. A non-finite action goes to the shield and counts as `invalid`. A pursuer whose wheel speeds are
+    not finite stands still, which counts as `pursuer_invalid`.
     """
     episodes, batch = whole_number("episodes", episodes), whole_number("batch", batch, most=2**20)
     policy, pursuer = as_policy(policy, scenario), as_pursuer(pursuer)
     decision_steps_of(policy)
-    # Someone's code on the host would only be waited for by several threads.
-    asked = isinstance(policy, HostPolicy) or runs_on_host(pursuer, scenario)
-    most = 1 if asked else min(episodes, max(1, batch // _LEAST_WIDTH))
+    # Python code on the host runs in one thread at a time.
+    on_host = isinstance(policy, HostPolicy) or runs_on_host(pursuer, scenario)
+    most = 1 if on_host else min(episodes, max(1, batch // _LEAST_WIDTH))
     threads = useful_threads(most if threads is None else min(most, whole_number("threads", threads)))
     width = batch if threads == 1 else -(-batch // (threads * _WHOLE)) * _WHOLE
     task = Task(scenario, policy, as_shield(shield, scenario), pursuer)
     reading = {"kept": no_periods(), "read": add_periods} if mapped else {}
     trial = Trial(task, as_key(key), width, **reading)
     shares = [episodes * share // threads for share in range(threads + 1)]
-    crews = [Crew(trial, *share) for share in pairwise(shares)]
+    batches = [EpisodeBatch(trial, *share) for share in pairwise(shares)]
     if threads > 1:
-        # Else each would compile it.
-        crews[0].get_ready()
+        # Otherwise every thread would compile.
+        batches[0].get_ready()
     finished = 0
 
-    def tell(more: int) -> None:
+    def report(more: int) -> None:
         nonlocal finished
         finished += more
         if progress is not None:
             progress(finished, episodes)
 
-    side_by_side(crews, tell)
-    results = {name: np.concatenate([crew.results[name] for crew in crews]) for name in crews[0].results}
+    side_by_side(batches, report)
+    names = batches[0].results
+    results = {name: np.concatenate([part.results[name] for part in batches]) for name in names}
     where = None
     if mapped:
         where = InterventionMap.of_sums(
-            float(map_reach(scenario)), np.sum([crew.sums for crew in crews], axis=0)
+            float(map_reach(scenario)), np.sum([part.sums for part in batches], axis=0)
         )
     return _evaluation(scenario, results, where)
 

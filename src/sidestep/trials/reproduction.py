@@ -1,4 +1,4 @@
-"""The paper's experiment as one study: train, measure and test under several shields, side by side."""
+"""The paper's experiment as one study: train, measure and test under several shields."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ PAPER: dict[str, Any] = {
     },
     "scene_trained": {"outcome": "reached"},
 }
-"""What the paper reports (section IV and its Table I), under the names of our own figures."""
+"""The paper's results (section IV and Table I), under the names used here."""
 
 COMPARED = ("none", "paper", "game", "joint")
 """Shields that are compared unless others are named. A newly registered one is not."""
 
 Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
-"""Opens a progress display for a labelled part: a context manager that gives a callable."""
+"""Opens a progress display for a labelled part: returns a context manager that yields a callable."""
 
 
 @dataclass(frozen=True)
 class ShieldStudy:
-    """What the study found for one shield. Evaluations are `Evaluation.to_dict()`."""
+    """The results for one shield. Evaluations are `Evaluation.to_dict()`."""
 
     shield: str
     folder: Path
@@ -69,12 +69,12 @@ class ShieldStudy:
 
 
 def describe(trajectory: Trajectory) -> dict[str, Any]:
-    """A recorded episode in a few figures: outcome, time (s), clearances (m), corrections (m/s)."""
+    """A summary of a recorded episode: outcome, time (s), clearances (m), corrections (m/s)."""
     events, status = trajectory.events, np.asarray(trajectory.status)
     return json_safe(
         {
             "outcome": trajectory.outcome,
-            # The clock of a long episode has gathered rounding; its first tick has not.
+            # The time of the first period is exact; later times have accumulated rounding errors.
             "seconds": round(trajectory.length * float(trajectory.worlds.time[1]), 4),
             "return": float(events.reward.sum()),
             "min_pursuer_clearance": float(events.pursuer_clearance.min()),
@@ -89,7 +89,7 @@ def describe(trajectory: Trajectory) -> dict[str, Any]:
 
 
 def test_scene_of(scenario: Scenario) -> Scenario:
-    """The paper's fixed scene with the constants of `scenario`."""
+    """The paper's fixed test scene with the constants of `scenario`."""
     scene = scenario_to_dict(load_scenario("paper-test"))
     starts = {
         name: scene[name] for name in ("evader_start", "pursuer_starts", "obstacle_starts", "target_start")
@@ -117,9 +117,9 @@ def _recorded(path: Path, run: Callable[[], Trajectory]) -> Trajectory:
 
 
 def study_settings(folder: str | Path) -> dict[str, Any]:
-    """What `reproduce` needs to continue the study in `folder` as it was begun.
+    """The arguments with which `reproduce` continues the study in `folder`.
 
-    **Raises** `RunError` when there is none.
+    **Raises** `RunError` when the folder holds no study.
     """
     config = records.open_run(folder, "study")
     return {
@@ -146,14 +146,14 @@ def reproduce(
 ) -> list[ShieldStudy]:
     """Train under each shield, measure the trained and the untrained policy, run the paper's test scene.
 
-    Writes one run folder per shield in `out`, and `summary.json` with everything side by side. Each part is
-    kept once finished, so `resume` goes on where an interrupted study stopped, with the settings it was begun
-    with (`study_settings` reads them). Test starts come from another key than training starts. `out` and the
-    run folders are held until the last file is written.
+    Writes one run folder per shield in `out`, and `summary.json` with all results. Finished parts are kept,
+    so `resume` continues an interrupted study with its stored settings (`study_settings` reads them). Test
+    starts use another key than training starts. `out` and the run folders are locked until the last file is
+    written.
 
-    **Raises** `RunError` when `out` already holds something and `resume` is not set, or the study in it was
-    begun with other settings; `FolderInUseError` when someone else writes in it or in one of its run folders;
-    `ValueError` for bad arguments; `KeyboardInterrupt` when interrupted.
+    **Raises** `RunError` when `out` is occupied and `resume` is not set, or its study has other settings;
+    `FolderInUseError` when another process writes in it or in one of its run folders; `ValueError` for
+    invalid arguments; `KeyboardInterrupt` when interrupted.
     """
     scenario = load_scenario("paper") if scenario is None else scenario
     options = make_options() if options is None else options
@@ -191,7 +191,7 @@ def _run(
     training_progress: Hook,
     count_progress: Hook,
 ) -> list[ShieldStudy]:
-    """The study itself, its folders held."""
+    """The study, with its folders locked."""
     shields, pursuer, seed = config["study"], config["pursuer"], config["seed"]
     episodes, evaluation_episodes = config["episodes"], config["evaluation_episodes"]
     if resume:
@@ -214,7 +214,7 @@ def _run(
             if training.interrupted:
                 raise KeyboardInterrupt
         else:
-            # Trained on by itself meanwhile, it would no longer be what the others are compared with.
+            # A run that was trained further by itself is no longer comparable with the others.
             records.refuse_changes(folder, records.open_run(folder), config, ("episodes",))
         policy = load_policy(folder)
 

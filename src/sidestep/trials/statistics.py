@@ -1,4 +1,4 @@
-"""What can honestly be said from a finite number of episodes or seeds."""
+"""Confidence intervals and comparisons from a finite number of episodes or seeds."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,11 +16,11 @@ def _check_level(level: float | int) -> None:
 
 
 def wilson_interval(count: int, total: int, level: float | int = 0.95) -> tuple[float, float]:
-    """Wilson's score interval for the rate behind `count` events in `total` trials.
+    """Wilson's score interval of the rate, for `count` events in n = `total` trials.
 
     (p + z^2/2n +- z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n), with p = count/n and z the normal quantile
-    (Wilson, JASA 1927). Unlike p +- z sqrt(p (1 - p)/n) it is never empty at zero events. No trials say
-    nothing: (0, 1).
+    (Wilson, JASA 1927). Unlike p +- z sqrt(p (1 - p)/n) it has positive width at zero events. Without trials
+    it is (0, 1).
 
     **Raises** `ValueError` unless 0 <= count <= total and 0 < level < 1.
     """
@@ -33,14 +33,14 @@ def wilson_interval(count: int, total: int, level: float | int = 0.95) -> tuple[
     rate, shrink = count / total, 1.0 + z * z / total
     centre = (rate + z * z / (2.0 * total)) / shrink
     half = z / shrink * math.sqrt(rate * (1.0 - rate) / total + (z / (2.0 * total)) ** 2)
-    # At the ends the exact values are 0 and 1; rounding must not leave the unit interval or the rate out.
+    # At count 0 or n one bound is exactly 0 or 1; rounding must not exclude the rate or leave [0, 1].
     return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
 
 
 def zero_event_bound(total: int, level: float | int = 0.95) -> float:
     """Upper confidence bound of a rate after no event in `total` trials: 1 - (1 - level)^(1/total).
 
-    The rule of three, 3/total at 95 %, is its approximation from above. No trials say nothing: 1.
+    The rule of three, 3/total at 95 %, approximates it from above. Without trials it is 1.
     """
     _check_level(level)
     if total < 0:
@@ -51,8 +51,8 @@ def zero_event_bound(total: int, level: float | int = 0.95) -> float:
 def interquartile_mean(values: ArrayLike) -> float:
     """Mean of the middle half: a quarter of the values (rounded down) is cut off at each end.
 
-    Less noisy than the median, less fooled by outliers than the mean (Agarwal et al., NeurIPS 2021). NaN for
-    no values.
+    It varies less than the median and is more robust than the mean (Agarwal et al., NeurIPS 2021). NaN
+    without values.
     """
     ordered = np.sort(np.asarray(values, dtype=float).reshape(-1))
     cut = len(ordered) // 4
@@ -60,7 +60,7 @@ def interquartile_mean(values: ArrayLike) -> float:
 
 
 class Interval(NamedTuple):
-    """An estimate and the interval around it."""
+    """An estimate and its confidence interval."""
 
     estimate: float
     low: float
@@ -77,10 +77,10 @@ def stratified_bootstrap(
 ) -> Interval:
     """Percentile bootstrap interval of `statistic` over all values, resampled within each stratum.
 
-    A stratum is what must not be mixed in resampling, a task or a scenario say, and holds one value per seed
-    (Agarwal et al., NeurIPS 2021). The same `seed` gives the same interval.
+    A stratum holds one value per seed of, for example, one task or scenario (Agarwal et al., NeurIPS 2021).
+    The same `seed` gives the same interval.
 
-    **Raises** `ValueError` when there is no stratum, an empty one, or a value that is not finite.
+    **Raises** `ValueError` without strata, for an empty stratum, and for a value that is not finite.
     """
     _check_level(level)
     groups = _strata(strata)
@@ -103,13 +103,12 @@ def probability_of_improvement(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """How probable it is that a value of `first` is greater than one of `second`, with a bootstrap interval.
+    """Probability that a value X of `first` is greater than a value Y of `second`, with bootstrap interval.
 
-    The mean over strata of P(X > Y) + P(X = Y)/2, which is Mann and Whitney's U over the number of pairs; the
-    values of both are resampled within each stratum (Agarwal et al., NeurIPS 2021). Over one half, `first` is
-    the better.
+    The mean over strata of P(X > Y) + P(X = Y)/2, which is Mann and Whitney's U over the number of pairs;
+    both are resampled within each stratum (Agarwal et al., NeurIPS 2021). Above 0.5, `first` is better.
 
-    **Raises** `ValueError` when the two differ in their number of strata, and as `stratified_bootstrap` does.
+    **Raises** `ValueError` when the numbers of strata differ, and as `stratified_bootstrap`.
     """
     _check_level(level)
     groups = _strata(first), _strata(second)
@@ -120,7 +119,7 @@ def probability_of_improvement(
     estimate, draws = 0.0, np.zeros(resamples)
     for x, y in pairs:
         wins = 0.5 * (1.0 + np.sign(x[:, None] - y[None, :]))
-        # How often each value was drawn, instead of the drawn values: a resample is then two products.
+        # With counts of how often each value was drawn, a resample is two matrix products.
         drawn_x = generator.multinomial(len(x), np.full(len(x), 1.0 / len(x)), size=resamples) / len(x)
         drawn_y = generator.multinomial(len(y), np.full(len(y), 1.0 / len(y)), size=resamples) / len(y)
         estimate += float(np.mean(wins)) / len(pairs)
@@ -130,7 +129,7 @@ def probability_of_improvement(
 
 
 def _strata(values: Sequence[ArrayLike]) -> list[np.ndarray]:
-    """Each stratum as finite numbers."""
+    """The strata as arrays; checks that they are finite."""
     groups = [np.asarray(stratum, dtype=float).reshape(-1) for stratum in values]
     if not groups or any(len(group) == 0 for group in groups):
         raise ValueError("every stratum needs at least one value")

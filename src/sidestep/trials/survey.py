@@ -1,5 +1,5 @@
-"""What an evaluation leaves in a run folder for those who look closer: every episode's figures, where the
-shield stepped in, and the worst episodes as recorded."""
+"""A survey of a run: every episode's results, the map of interventions, and recordings of the worst
+episodes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _MAP = "map."
 
 @dataclass(frozen=True)
 class WorstEpisode:
-    """One of the episodes that came nearest to capture or collision, or beyond.
+    """One of the episodes with the least clearances.
 
-    **Attributes:** `number` in the evaluation; `hazard` which of `HAZARDS` it was chosen for.
+    **Attributes:** `number` in the evaluation; `hazard`, the one of `HAZARDS` it was chosen for.
     """
 
     number: int
@@ -44,7 +44,8 @@ class WorstEpisode:
 
 @dataclass(frozen=True)
 class Survey:
-    """An evaluation episode by episode. `seed` it was measured with: `episode_key(seed, i)` is episode i."""
+    """An evaluation and its worst episodes. `seed` is that of the evaluation: `episode_key(seed, i)` is the
+    key of episode i."""
 
     evaluation: Evaluation
     seed: int
@@ -52,9 +53,9 @@ class Survey:
 
 
 def worst_numbers(evaluation: Evaluation) -> list[tuple[int, str]]:
-    """All episodes, the worst first: by turns the next nearest to capture and the next nearest to collision.
+    """All episode numbers, the worst first: alternately the next closest to capture and to collision.
 
-    Hazards that no robot is there for are left out.
+    Hazards without such a robot are left out.
     """
     orders = [
         [(int(number), hazard) for number in np.argsort(clearances, kind="stable")]
@@ -81,12 +82,12 @@ def record_worst(
     *,
     most: int = 4,
 ) -> tuple[WorstEpisode, ...]:
-    """Run the worst episodes of an evaluation again, `most` of them.
+    """Replay the `most` worst episodes of an evaluation.
 
-    **Arguments:** those that `evaluate` was called with.
+    **Arguments:** those of the call of `evaluate`.
     """
     found = []
-    # Rounding may differ between one episode and a batch, and an episode near the edge end otherwise.
+    # Rounding differs between a single episode and a batch, so a borderline episode may end differently.
     for number, hazard in worst_numbers(evaluation)[: 2 * most]:
         if len(found) == most:
             break
@@ -106,7 +107,7 @@ def take_survey(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Survey:
-    """Evaluate and look closer. Arguments and errors are those of `evaluate`."""
+    """Evaluate, and record the worst episodes. Arguments and errors are those of `evaluate`."""
     evaluation = evaluate(
         scenario, policy, shield, pursuer, episodes, seed, batch=min(episodes, 256), mapped=True,
         progress=progress,
@@ -117,12 +118,12 @@ def take_survey(
 def survey_run(
     folder: str | Path, episodes: int, *, progress: Callable[[int, int], None] | None = None
 ) -> Survey:
-    """A survey of a run's policy in its own scenario, under its own shield, against its own pursuer.
+    """A survey of a run's policy, with the run's scenario, shield and pursuer.
 
     The episodes are the first ones of those on which `reproduce` measures a run with this seed.
 
     **Raises** `RunError` when the folder holds no run or no policy yet, `ValueError` when its shield or
-    pursuer is none of ours.
+    pursuer is a custom one.
     """
     config = open_run(folder)
     scenario = load_scenario("paper", **config["scenario"])
@@ -134,16 +135,16 @@ def survey_run(
 
 
 def save_survey(folder: str | Path, survey: Survey) -> None:
-    """Write `episodes.npz` and `worst/` in a run folder; `episodes.npz` last, so that it speaks for all.
+    """Write `worst/` and then `episodes.npz` in a run folder, so that `episodes.npz` implies the rest.
 
-    **Raises** `FolderInUseError` when someone else writes there.
+    **Raises** `FolderInUseError` when another process writes there.
     """
     with held_if_run(folder):
         _save(Path(folder), survey)
 
 
 def _save(folder: Path, survey: Survey) -> None:
-    scenario, about = _told(folder)
+    scenario, about = _scenario_and_about(folder)
     for episode in survey.worst:
         save_trajectory(_worst_path(folder, episode.number), episode.trajectory, scenario, about)
     arrays: dict[str, Any] = {
@@ -165,8 +166,7 @@ def _save(folder: Path, survey: Survey) -> None:
 
 
 def load_survey(folder: str | Path) -> Survey | None:
-    """What `save_survey` wrote; None for a folder without it, such as one from before there were surveys, or
-    in which another policy was put since: training went on.
+    """Read a survey of `save_survey`; None if there is none, or if training has changed the policy since.
 
     **Raises** `RunError` when the file is damaged.
     """
@@ -195,8 +195,8 @@ def load_survey(folder: str | Path) -> Survey | None:
     return Survey(evaluation, seed, worst)
 
 
-def _told(folder: Path) -> tuple[Scenario | None, dict[str, Any]]:
-    """The scenario of a run folder and what else its episodes are to say of themselves."""
+def _scenario_and_about(folder: Path) -> tuple[Scenario | None, dict[str, Any]]:
+    """The scenario of a run folder, and the metadata of its recorded episodes."""
     if not (folder / "config.json").is_file():
         return None, {}
     config = read_json(folder / "config.json")
@@ -205,7 +205,7 @@ def _told(folder: Path) -> tuple[Scenario | None, dict[str, Any]]:
 
 
 def _policy_digest(folder: Path) -> str:
-    """Which policy a run folder holds; empty when it holds none."""
+    """The digest of a run folder's policy; empty if it has none."""
     path = folder / "policy.npz"
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 

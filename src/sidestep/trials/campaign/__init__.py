@@ -1,4 +1,4 @@
-"""Many trials as one: which jobs a file asks for, what each came to, and how they compare."""
+"""Campaigns: the jobs of a campaign file, their results, and comparisons."""
 
 from sidestep.store.campaign import Store
 from sidestep.trials.campaign.comparison import Comparison, Group, Pair, compare

@@ -1,4 +1,4 @@
-"""How groups of jobs compare: interquartile means and probabilities of improvement, with intervals."""
+"""Compare groups of jobs: interquartile means and probabilities of improvement, with intervals."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _Values = dict[_Labels, list[float]]
 
 @dataclass(frozen=True)
 class Group:
-    """One group in one figure: its interquartile mean with the 95 % bootstrap interval, and from what.
+    """One group in one figure: its interquartile mean with the 95 % bootstrap interval.
 
-    `fewest` is the smallest number of seeds in a stratum; with one there is nothing to resample, and the
-    interval says nothing.
+    `fewest` is the smallest number of seeds in a stratum. With one seed there is nothing to resample, and the
+    interval is meaningless.
     """
 
     labels: dict[str, Any]
@@ -32,8 +32,8 @@ class Group:
 
 @dataclass(frozen=True)
 class Pair:
-    """How probable it is that a job of `first` does better than one of `second` in the same stratum, with the
-    95 % bootstrap interval."""
+    """Probability that a job of `first` is better than one of `second` in the same stratum, with the 95 %
+    bootstrap interval."""
 
     first: dict[str, Any]
     second: dict[str, Any]
@@ -43,7 +43,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One figure over all groups. `left_out` jobs had no finite value of it."""
+    """One figure over all groups. `left_out` is the number of jobs without a finite value."""
 
     figure: str
     lower_is_better: bool
@@ -52,7 +52,7 @@ class Comparison:
     left_out: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """JSON values."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, Interval):
@@ -73,12 +73,12 @@ def compare(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Comparison:
-    """Compare the groups of rows that share the labels `by`, in one figure (Agarwal et al., NeurIPS 2021).
+    """Compare groups of rows in one figure (Agarwal et al., NeurIPS 2021). A group shares the labels `by`.
 
-    Within a group, rows that share all other labels but the seed are a stratum: seeds are resampled within it
-    and never across. Pairs are compared over the strata that both have.
+    Rows of a group that differ only in the seed form a stratum. Seeds are resampled within a stratum only.
+    Pairs are compared over the strata that both have.
 
-    **Raises** `ValueError` when no row has the figure as a number.
+    **Raises** `ValueError` when no row has a numeric value of the figure.
     """
     strata_by = [axis for axis in AXES if axis not in (*by, "seed")]
     groups: dict[_Labels, _Values] = {}

@@ -1,4 +1,4 @@
-"""One job of a campaign: what decides its result, and how it is run."""
+"""One job of a campaign: its settings, and how it is run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sidestep.store.runs import summarise
 
 KINDS = ("evaluate", "train")
 AXES = ("scenario", "shield", "pursuer", "policy", "learner", "seed")
-"""What a grid may run over, the fastest last."""
+"""The possible axes of a grid; the last one varies fastest."""
 
 _FORMAT = 1
 _VERSIONED = ("sidestep", "jax", "jaxlib", "equinox", "optax", "numpy")
@@ -31,10 +31,10 @@ _VERSIONED = ("sidestep", "jax", "jaxlib", "equinox", "optax", "numpy")
 
 @dataclass(frozen=True)
 class Task:
-    """What a worker is sent: plain values only.
+    """A job as sent to a worker: plain values only.
 
-    **Attributes:** `job` the identity; `settings` everything that decides the result; `policy` the file whose
-    policy is measured, if it is not the untrained one.
+    **Attributes:** `job` the identity; `settings` everything that determines the result; `policy` the file of
+    the policy to measure, None for the untrained policy.
     """
 
     job: str
@@ -44,7 +44,8 @@ class Task:
 
 @dataclass(frozen=True)
 class Job:
-    """One combination of a grid. `labels` is what the file calls it, per axis; names decide nothing."""
+    """One combination of a grid. `labels` are its names in the file, per axis; they do not affect the
+    result."""
 
     labels: dict[str, Any]
     settings: dict[str, Any]
@@ -56,12 +57,12 @@ class Job:
 
     @property
     def task(self) -> Task:
-        """The job as it is sent to a worker."""
+        """The job as sent to a worker."""
         return Task(self.id, self.settings, self.policy)
 
 
 def identity(settings: Mapping[str, Any]) -> str:
-    """20 hexadecimal digits of SHA-256 over the settings: the same settings are the same job, anywhere."""
+    """20 hexadecimal digits of SHA-256 over the settings: equal settings give the same job on any machine."""
     text = json.dumps({"format": _FORMAT, **settings}, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
@@ -72,7 +73,7 @@ def digest_of_file(path: str | Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Python's version and those of the packages that compute."""
+    """The versions of Python and of the numerical packages."""
     import sidestep
 
     found = {"python": platform.python_version()}
@@ -81,12 +82,12 @@ def versions() -> dict[str, str]:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    # A source folder on the path has no metadata of its own.
+    # A source folder on the path has no metadata.
     return found | {"sidestep": sidestep.__version__}
 
 
 def flat(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """A table within figures as one figure per entry, `NAME_ENTRY`."""
+    """Figures with nested tables flattened: one figure per entry, `NAME_ENTRY`."""
     found: dict[str, Any] = {}
     for name, value in figures.items():
         if isinstance(value, Mapping):
@@ -97,7 +98,7 @@ def flat(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def figure_names(kind: str) -> list[str]:
-    """What a job of this kind comes to, by name, before any has run."""
+    """The names of the figures of a job of this kind."""
     from sidestep.trials.evaluation import Evaluation
 
     whole, real = np.zeros(1, np.int32), np.zeros(1)
@@ -109,18 +110,18 @@ def figure_names(kind: str) -> list[str]:
 
 
 def run_task(task: Task, folder: Path | None) -> dict[str, Any]:
-    """Run a job to its end and say what it came to: plain JSON values.
+    """Run a job and return its record, as JSON values.
 
-    **Arguments:** `folder` for what a training leaves; it goes on where it stopped if it was begun there.
-    Without one nothing but the figures is kept.
+    **Arguments:** `folder` for the run folder of a training; an interrupted training in it is resumed. With
+    None only the figures are kept.
 
-    **Raises** what the job itself raises; `ValueError` when the policy's file has changed meanwhile.
+    **Raises** what the job raises; `ValueError` when the policy's file has changed.
     """
     return _RUN[task.settings["kind"]](task, folder)
 
 
 def record_of(task: Task, figures: Mapping[str, Any], seconds: float | int) -> dict[str, Any]:
-    """What is kept of a job: its settings and figures, and where, when and with what it ran."""
+    """The record of a job: settings, figures, host, time and versions."""
     return json_safe(
         {
             "job": task.job,
@@ -144,7 +145,7 @@ def _run_evaluate(task: Task, folder: Path | None) -> dict[str, Any]:
     policy: Any = settings["policy"]
     if task.policy is not None:
         if digest_of_file(task.policy) != policy:
-            raise ValueError(f"{task.policy} is no longer the policy that this campaign was begun with")
+            raise ValueError(f"{task.policy} is no longer the policy with which this campaign began")
         policy = load_policy(task.policy)
     evaluation = evaluate(
         load_scenario("paper", **settings["scenario"]), policy, settings["shield"], settings["pursuer"],
@@ -161,7 +162,7 @@ def _run_train(task: Task, folder: Path | None) -> dict[str, Any]:
 
     settings = task.settings
     scenario = load_scenario("paper", **settings["scenario"])
-    # Someone may be at it by hand: the job waits for them, and goes on from there.
+    # Another process may be training in the folder: the job waits for it, then continues.
     with nullcontext() if folder is None else hold(folder, wait=True):
         training = train(
             scenario, shield=settings["shield"], pursuer=settings["pursuer"], seed=settings["seed"],
@@ -175,8 +176,10 @@ def _run_train(task: Task, folder: Path | None) -> dict[str, Any]:
         evaluation_seed(settings["seed"]), batch=settings["batch"],
     )  # fmt: skip
     about = ("scenario", "shield", "pursuer", "seed", "version")
-    told = {f"training_{name}": value for name, value in training.summary.items() if name not in about}
-    return {**evaluation.to_dict(), **told}
+    training_figures = {
+        f"training_{name}": value for name, value in training.summary.items() if name not in about
+    }
+    return {**evaluation.to_dict(), **training_figures}
 
 
 _RUN = {"evaluate": _run_evaluate, "train": _run_train}

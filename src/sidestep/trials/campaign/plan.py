@@ -1,4 +1,4 @@
-"""Which jobs does a campaign file ask for? Everything is checked before anything runs."""
+"""Read a campaign file and lay out its jobs. Everything is checked before anything runs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class CampaignError(ValueError):
 class CompareSettings:
     """What to compare: groups of jobs that share the labels `by`, in each of `figures`.
 
-    In those of `lower_is_better`, less counts as an improvement.
+    For the figures in `lower_is_better`, a lower value is an improvement.
     """
 
     by: tuple[str, ...]
@@ -53,7 +53,7 @@ class CompareSettings:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Jobs in the order of the grid, no two alike; `text` is the file they come from."""
+    """The distinct jobs of a campaign, in the order of the grid; `text` is the content of its file."""
 
     name: str
     kind: str
@@ -63,9 +63,9 @@ class Campaign:
 
 
 def load_campaign(path: str | Path) -> Campaign:
-    """Read a campaign file, check all that it names, and lay out its grid.
+    """Read a campaign file, check its values, and lay out its grid.
 
-    Files that it names are looked for from its own folder.
+    Paths in it are relative to its folder.
 
     **Raises** `CampaignError` (a `ValueError`) naming the file, the key, its value and what is allowed.
     """
@@ -81,7 +81,7 @@ def load_campaign(path: str | Path) -> Campaign:
 
 
 class _Reader:
-    """One file being read, so that every message can name it."""
+    """Reads one file; error messages name the file and the key."""
 
     def __init__(self, path: Path, content: dict[str, Any]):
         self.path, self.content = path, content
@@ -142,7 +142,7 @@ class _Reader:
             self.whole(f"settings.{name}", value, 1)
         settings = {**defaults, **table}
         if kind == "evaluate":
-            # More slots than episodes would only be stepped for nothing.
+            # Slots beyond the number of episodes would be stepped in vain.
             settings["batch"] = min(settings["batch"], settings["episodes"])
         return settings
 
@@ -151,7 +151,7 @@ class _Reader:
             self.fail(key, f"= {value!r}: it must be a whole number of at least {least}")
 
     def axes(self, kind: str) -> dict[str, list[Any]]:
-        """The labels along each axis, in order; each once."""
+        """The distinct labels of each axis, in order."""
         grid = self.table("grid")
         self.known("grid", grid, _KIND_AXES[kind])
         axes: dict[str, list[Any]] = {}
@@ -167,7 +167,7 @@ class _Reader:
                     self.fail(f"grid.{name}", f"holds {label!r}: names are needed, as text")
             if len(set(values)) < len(values):
                 twice = next(label for label in values if values.count(label) > 1)
-                self.fail(f"grid.{name}", f"holds {twice!r} twice; each value may stand there once")
+                self.fail(f"grid.{name}", f"holds {twice!r} twice; each value may occur once")
             axes[name] = values
         count = 1
         for values in axes.values():
@@ -197,7 +197,7 @@ class _Reader:
         return seeds
 
     def choices(self, axis: str, labels: list[Any]) -> dict[Any, Any]:
-        """What each label stands for, checked."""
+        """The value of each label, checked."""
         if axis == "seed":
             return {seed: seed for seed in labels}
         read = {
@@ -219,7 +219,7 @@ class _Reader:
         return choices
 
     def scenario(self, label: str) -> dict[str, Any]:
-        """All fields that are set, so that the job says by itself what it is; the name decides nothing."""
+        """All fields of the scenario, so that the job's settings do not depend on the name."""
         described = self.table("scenarios")
         if label in described:
             if not isinstance(described[label], dict):
@@ -232,7 +232,7 @@ class _Reader:
         return {name: value for name, value in fields.items() if value is not None and name != "name"}
 
     def named_file(self, name: str) -> str:
-        """`name`, or the file that it names, seen from the campaign file's folder."""
+        """`name`, or the path of the file it names, relative to the campaign file's folder."""
         file = self.path.parent / name
         return str(file) if file.is_file() else name
 
@@ -251,7 +251,7 @@ class _Reader:
         return json_safe(options_to_dict(make_options(**described.get(label, {}))))
 
     def policy(self, label: str) -> tuple[str, str | None]:
-        """What identifies the policy, and the file that holds it."""
+        """The policy's identity and its file."""
         if label == GOAL_SEEKING:
             return label, None
         path = (self.path.parent / label).absolute()
@@ -260,7 +260,7 @@ class _Reader:
         return digest_of_file(file), str(file)
 
     def check_policies(self, choices: Mapping[str, Mapping[Any, Any]]) -> None:
-        """Whether every policy was trained on observations of the size that every scenario has."""
+        """Fail unless each policy's observation size matches each scenario."""
         from sidestep.loop.policies import as_policy
 
         for policy, (_, file) in choices["policy"].items():

@@ -10,10 +10,10 @@ from sidestep.trials.campaign.jobs import Job, flat
 
 
 def campaign_rows(jobs: Iterable[Job], store: Store) -> list[dict[str, Any]]:
-    """One row for each of these jobs that has a result, in their order.
+    """One row per job with a result, in the order of the jobs.
 
-    Its labels, its figures (a table within them as one column per entry), then where, when and with what
-    versions it ran, and the folder of its training, if it left one.
+    Columns: labels, figures (nested tables flattened), host, time, versions, and the run folder of a
+    training.
     """
     rows = []
     for job in jobs:
@@ -21,7 +21,7 @@ def campaign_rows(jobs: Iterable[Job], store: Store) -> list[dict[str, Any]]:
         if record is None:
             continue
         row: dict[str, Any] = {"job": job.id, **job.labels}
-        # A figure never takes the place of a label.
+        # A label takes precedence over a figure of the same name.
         row |= {name: value for name, value in flat(record["figures"]).items() if name not in row}
         row |= {name: record[name] for name in ("seconds", "ended", "host", "process")}
         row |= {f"version_{name}": value for name, value in record["versions"].items()}

@@ -1,4 +1,4 @@
-"""Pursuers made for attacking: one that plays a given plan, one of several, one that herds."""
+"""Pursuers for attacks: a given plan, one of several strategies, a herder, a sideswiper, random switching."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STAND_OFF = 0.1
 
 @final
 class Script(Pursuer):
-    """Plays given wheel speeds, one row for each control period, and stays with the last row after it.
+    """Plays given wheel speeds, one row per control period, and holds the last row afterwards.
 
     **Arguments:** `plan (t, m, 2)` wheel rim speeds (left, right) of each pursuer, m/s; `first` the number of
     the control period, counted from the world's time 0, at which row 0 is played.
@@ -46,7 +46,7 @@ def script(part: tuple[Float[Array, "t m 2"], Int[Array, ""]]) -> Script:
 
 @final
 class OneOf(Pursuer):
-    """Strategy number `index` of several, so that one batch of chases can hold them all."""
+    """Strategy `index` of several, so that one batch of chases can use them all."""
 
     strategies: tuple[Pursuer, ...]
     index: Int[Array, "*batch"]
@@ -59,7 +59,7 @@ class OneOf(Pursuer):
 
 
 class Roster(eqx.Module):
-    """Several strategies; called with a number it gives that one."""
+    """Several strategies; a call with an index returns that one."""
 
     strategies: tuple[Pursuer, ...]
 
@@ -69,18 +69,18 @@ class Roster(eqx.Module):
 
 
 def built_in() -> Roster:
-    """Every built-in strategy that moves."""
+    """All built-in strategies that move."""
     return Roster(tuple(make_pursuer(name) for name in PURSUERS if name != "still"))
 
 
 @final
 class Herder(Pursuer):
-    """Drives the evader into something: goes behind it as seen from there, and strikes from that side.
+    """Drives the evader towards an obstacle: moves to the opposite side of the evader, then attacks.
 
-    Its place is on the line from the nearest obstacle (or the target) through the evader, outside the capture
-    set. Once that line and its line of sight differ by less than `strikes_within` (rad) it strikes as `nash`
-    does, which pins the evader between the two. With `toward_target`, or without obstacles, it herds toward
-    the target.
+    It goes to a point on the line from the nearest obstacle (or the target) through the evader, outside the
+    capture set. When that line and its line of sight differ by less than `strikes_within` (rad) it attacks as
+    `nash`, which pins the evader between the two. With `toward_target`, or without obstacles, it herds
+    towards the target.
     """
 
     toward_target: Bool[Array, "*batch"]
@@ -111,12 +111,12 @@ def herder(part: tuple[Bool[Array, ""], Float[Array, ""]]) -> Herder:
 
 @final
 class Sideswiper(Pursuer):
-    """Drives alongside the evader, between it and its target, lets it come close, and swings in.
+    """Drives alongside the evader, between it and its target, lets it come close, and turns in.
 
-    Beside the pursuer the evader may come as near as it likes, for there contact cannot be forced. But within
-    one control period the pursuer gains V^2 T^2/(8 b) by turning in with the inner wheel at rest, before a
-    sampled shield can answer. It strikes once less than the share `patience` of that is left; `lead` (rad) is
-    how far from the evader's way to its target it waits.
+    In continuous time the pursuer cannot force contact beside its axle, so the evader may come close there.
+    Within one control period, however, it gains V^2 T^2/(8 b) by turning with the inner wheel at rest, before
+    a sampled shield can answer. It attacks when the clearance is below the share `patience` of that. `lead`
+    (rad) is the angle between its waiting position and the evader's path to the target.
     """
 
     patience: Float[Array, "*batch"]
@@ -128,7 +128,7 @@ class Sideswiper(Pursuer):
         z = to_pursuer_frame(world.evader, pose)
         onward = _unit(world.target - world.evader)
         left = jnp.where(z[1] < 0.0, -1.0, 1.0).astype(z.dtype)
-        # Abreast: the evader straight to one side, both equally fast along the pursuer's axis.
+        # Abreast: the evader is beside the pursuer, with equal speed along the pursuer's axis.
         axis = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
         along = jnp.sum(world.evader_velocity * axis) + z[0] / (4.0 * period)
         along = jnp.clip(along, -speed, speed)
@@ -138,12 +138,12 @@ class Sideswiper(Pursuer):
             (speed - jnp.abs(along)) / axle,
         )
         beside = wheels_from_body(along, turning, axle)
-        # Swinging in: the wheel away from the evader at full speed, the other at rest.
+        # Turning in: the far wheel at full speed, the near wheel at rest.
         way = jnp.where(along < 0.0, -1.0, 1.0).astype(z.dtype)
         right_wheel = (left > 0.0).astype(z.dtype)
         swing = way * speed * jnp.stack([1.0 - right_wheel, right_wheel])
         gap = norm(z) - scenario.capture_distance
-        # Elsewhere: to a place ahead of the evader, off its way by `lead`.
+        # Elsewhere: to a point ahead of the evader, at angle `lead` from its path.
         sine, cosine = jnp.sin(self.lead), jnp.cos(self.lead)
         ahead = jnp.stack([cosine * onward[0] - sine * onward[1], sine * onward[0] + cosine * onward[1]])
         station = world.evader + (scenario.capture_distance + _STAND_OFF) * ahead
@@ -169,10 +169,10 @@ def _unit(offset: Float[AnyArray, "2"]) -> Float[Array, "2"]:
 def bang_bang(
     scenario: Scenario, key: PRNGKeyArray, periods: int, longest: Float[Array, ""]
 ) -> Float[Array, "t m 2"]:
-    """Wheels that run full ahead or full back and switch at random; m/s.
+    """Wheel speeds (m/s) of +V or -V that switch at random.
 
-    Each wheel of each pursuer changes its mind with probability 1/dwell in every period, its mean dwell time
-    drawn once from 1 to `longest` periods, small ones as likely as large ones.
+    Each wheel draws a new sign with probability 1/dwell in every period. Its mean dwell time is drawn once,
+    log-uniformly from 1 to `longest` periods.
     """
     dwell_key, switch_key, side_key = jax.random.split(key, 3)
     shape = (scenario.pursuer_count, 2)
@@ -191,7 +191,7 @@ def bang_bang(
 def escape_margin(scenario: Scenario, world: World) -> Scalar:
     """Least signed distance h (m) of the evader from a pursuer's capture set; +inf without pursuers.
 
-    Below 0 a pursuer captures by driving straight, whatever the evader does.
+    Below 0 a pursuer captures by driving straight, for any motion of the evader.
     """
     z = jax.vmap(to_pursuer_frame, in_axes=(None, 0))(world.evader, world.pursuers)
     values = jax.vmap(capture_set_distance, in_axes=(0, None, None))(

@@ -1,4 +1,4 @@
-"""The attacks by name. Each comes in rounds: a batch of chases, with everything needed to play them again."""
+"""The attacks by name. An attack runs in rounds: batches of chases that can be replayed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sidestep.learning import TD3
 from sidestep.trials.falsification.attackers import Roster, bang_bang, built_in, herder, script, sideswiper
 from sidestep.trials.falsification.chases import Chase, Target, run_from
 from sidestep.trials.falsification.cross_entropy import Search
-from sidestep.trials.falsification.learned import Lessons, lesson, new_pupil
+from sidestep.trials.falsification.learned import PursuerTraining, train, untrained
 from sidestep.trials.falsification.planned import Planning, chase_with_plans, search_starts
 from sidestep.trials.falsification.starts import draw_starts, freedom
 from sidestep.world import World
@@ -25,11 +25,11 @@ from sidestep.world import World
 
 @dataclass(frozen=True)
 class Round:
-    """What a round of an attack came to, chase by chase.
+    """The result of a round of an attack, per chase.
 
-    **Attributes:** `starts` worlds; `wheels (n, t, m, 2)` m/s driven; `steps` control periods to the end;
-    `outcome` indices into `OUTCOMES`, -1 for a chase given up while it ran; the least clearances and the
-    least margin h, m; `searched` control periods simulated besides, on the way to a plan.
+    **Attributes:** `starts` worlds; `wheels (n, t, m, 2)` commanded, m/s; `steps` control periods to the end;
+    `outcome` indices into `OUTCOMES`, -1 for a chase that had not ended; the least clearances and the least
+    margin h, m; `searched` control periods simulated in addition, to find a plan.
     """
 
     starts: World
@@ -43,7 +43,7 @@ class Round:
 
     @property
     def simulated(self) -> int:
-        """Control periods simulated."""
+        """Number of control periods simulated."""
         return int(self.steps.sum()) + self.searched
 
 
@@ -62,19 +62,19 @@ def _round(starts: World, chases: Chase, wheels: Any, searched: int = 0) -> Roun
 
 
 class Attack(eqx.Module):
-    """A way of attacking. `state` (a pytree of arrays, or None) is what it learns from round to round."""
+    """An attack. `state` (a pytree of arrays, or None) is what it learns from round to round."""
 
     def init(self, key: PRNGKeyArray) -> Any:
         """The state before the first round."""
         return None
 
     def rows(self, state: Any) -> dict[str, int]:
-        """How many first rows of which leaves of the state are worth storing, as `write_arrays` takes it."""
+        """Per leaf of the state, the number of leading rows to store, as for `write_arrays`."""
         return {}
 
     @abc.abstractmethod
     def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
-        """One round against `target`. **Returns** the new state and what happened."""
+        """One round against `target`. **Returns** the new state and the round."""
 
 
 def _starts(target: Target, key: PRNGKeyArray, count: int, edge_share: float) -> World:
@@ -86,14 +86,14 @@ def _starts(target: Target, key: PRNGKeyArray, count: int, edge_share: float) ->
 def _chased(
     target: Target, pursuer: Any, parts: Any, starts: World, periods: int, key: PRNGKeyArray
 ) -> Round:
-    """A chase to its end from every start, by `pursuer` with that chase's part of `parts`."""
+    """A chase from every start; chase i is played by `pursuer(parts[i])`."""
     keys = jax.random.split(key, starts.evader.shape[0])
     return _round(starts, *run_from(target, pursuer, parts, starts, periods, keys))
 
 
 @final
 class Strategies(Attack):
-    """The built-in strategies in turn, from random starts and a quarter from the edge of the capture set."""
+    """The built-in strategies in turn, a quarter of them from the edge of the capture set."""
 
     roster: Roster
     chases: int = eqx.field(static=True)
@@ -108,7 +108,7 @@ class Strategies(Attack):
 
 @final
 class Herding(Attack):
-    """Herders that strike from near and from afar, toward the nearest obstacle or the target."""
+    """Herders with various attack angles, towards the nearest obstacle or the target."""
 
     chases: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
@@ -123,7 +123,7 @@ class Herding(Attack):
 
 @final
 class Sideswiping(Attack):
-    """Sideswipers of more and less patience, from ordinary starts and a quarter from the edge."""
+    """Sideswipers of various patience, a quarter of them from the edge of the capture set."""
 
     chases: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
@@ -144,7 +144,7 @@ def _bang_bang_plans(scenario: Any, keys: Key[Array, "n"], periods: int, longest
 
 @final
 class BangBang(Attack):
-    """Wheels full ahead or full back that switch at random, half of them from the edge of the capture set."""
+    """Wheel speeds of +V or -V that switch at random, half of them from the edge of the capture set."""
 
     chases: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
@@ -160,7 +160,7 @@ class BangBang(Attack):
 
 @final
 class CrossEntropy(Attack):
-    """Start and wheel speeds found together, then planned anew as the chase goes on."""
+    """Searches start and wheel speeds together, then replans during the chase."""
 
     planning: Planning
     chases: int = eqx.field(static=True)
@@ -184,31 +184,31 @@ class CrossEntropy(Attack):
 
 @final
 class Learned(Attack):
-    """A pursuer that TD3 trains to break this very shield."""
+    """A pursuer that TD3 trains against this shield."""
 
-    lessons: Lessons
+    training: PursuerTraining
 
     def init(self, key: PRNGKeyArray) -> Any:
-        return new_pupil(self.lessons, key)
+        return untrained(self.training, key)
 
     def rows(self, state: Any) -> dict[str, int]:
-        return {".ring.rows": min(int(state.ring.written), self.lessons.capacity)}
+        return {".ring.rows": min(int(state.ring.written), self.training.capacity)}
 
     def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
-        start_key, lesson_key = jax.random.split(key)
-        starts = _starts(target, start_key, self.lessons.chases, 0.5)
-        state, chases, wheels = lesson(target, self.lessons, state, starts, goal, lesson_key)
+        start_key, training_key = jax.random.split(key)
+        starts = _starts(target, start_key, self.training.chases, 0.5)
+        state, chases, wheels = train(target, self.training, state, starts, goal, training_key)
         return state, _round(starts, chases, wheels)
 
 
 ATTACKS = ("pursuers", "bang-bang", "herder", "sideswipe", "cross-entropy", "edge", "learned")
-"""Every attack by name, in the order in which they take turns."""
+"""The names of all attacks, in the order of their turns."""
 
 
 def make_attack(name: str, batch: int = 256, periods: int = 1200) -> Attack:
     """The attack `name`.
 
-    **Arguments:** `batch` chases or plans at once, which bounds memory and sets the length of a round;
+    **Arguments:** `batch` chases or plans at once, which determines memory and the length of a round;
     `periods` the longest chase, in control periods.
 
     **Raises** `ValueError` naming the known attacks.
@@ -235,5 +235,5 @@ def make_attack(name: str, batch: int = 256, periods: int = 1200) -> Attack:
     if name == "learned":
         algorithm = TD3(discount=0.97, actor_learning_rate=1e-3, critic_learning_rate=1e-3, hidden=(128, 128))
         chases = max(1, batch // 8)
-        return Learned(Lessons(algorithm, chases=chases, decisions=max(1, min(periods, 400) // 4)))
+        return Learned(PursuerTraining(algorithm, chases=chases, decisions=max(1, min(periods, 400) // 4)))
     raise ValueError(f"no attack {name!r}; use one of {', '.join(map(repr, ATTACKS))}")

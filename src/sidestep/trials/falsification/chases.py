@@ -1,4 +1,4 @@
-"""Many chases at once, each against its own pursuer, recorded so that any of them can be played again."""
+"""Many chases at once, each with its own pursuer, recorded so that each can be replayed."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.world import Scenario, World
 
 GOALS = ("capture", "collision", "both")
-"""What an attack may want."""
+"""What an attack may aim for."""
 
 _FAINT = 0.02
 
 
 class Target(eqx.Module):
-    """What is attacked: the evader's `policy` behind its `shield` in a `scenario`."""
+    """The evader under attack: its `policy` behind its `shield` in a `scenario`."""
 
     scenario: Scenario
     policy: Callable[..., Any]
     shield: Any
 
     def task(self, pursuer: Callable[..., Any]) -> Task:
-        """The same with a pursuer to hunt it."""
+        """The task of this evader against a pursuer."""
         return Task(self.scenario, self.policy, self.shield, pursuer)
 
 
 class Chase(eqx.Module):
-    """An episode, and the `margin`: the least h (m, see `escape_margin`) at the end of a period."""
+    """An episode, and its `margin`: the least h (m, see `escape_margin`) at the ends of its periods."""
 
     episode: Episode
     margin: Float[Array, "*batch"]
 
     @property
     def world(self) -> World:
-        """Where everything is."""
+        """The current world."""
         return self.episode.world
 
     @property
     def outcome(self) -> Int[Array, "*batch"]:
-        """As of the episode: `RUNNING` or an index into `OUTCOMES`."""
+        """`RUNNING` or an index into `OUTCOMES`."""
         return self.episode.outcome
 
     @property
@@ -57,7 +57,7 @@ class Chase(eqx.Module):
 
     @property
     def tally(self) -> Tally:
-        """What the episode has come to so far."""
+        """The episode's tally so far."""
         return self.episode.tally
 
 
@@ -67,14 +67,15 @@ def begin(target: Target, world: World) -> Chase:
 
 
 def forget(chases: Chase) -> Chase:
-    """The same chases with nothing remembered of how close they were."""
+    """The chases with their least clearances and margins reset."""
     far = jnp.full_like(chases.margin, jnp.inf)
     parts = lambda chase: (chase.tally.pursuer_clearance, chase.tally.obstacle_clearance, chase.margin)  # noqa: E731
     return eqx.tree_at(parts, chases, (far,) * 3)
 
 
 def one_period(task: Task, chase: Chase, key: PRNGKeyArray) -> tuple[Chase, Float[Array, "m 2"]]:
-    """A chase one control period later, and the wheel speeds (m/s) asked for; one that ended stays."""
+    """Advance a chase by one control period; returns it and the commanded wheel speeds (m/s). A chase that
+    has ended does not change."""
     after, period = advance(task, chase.episode, key)
     margin = jnp.minimum(chase.margin, escape_margin(task.scenario, period.after))
     margin = jnp.where(period.running, margin, chase.margin)
@@ -90,12 +91,12 @@ def run(
     periods: int,
     keys: Key[Array, "n"],
 ) -> tuple[Chase, Float[Array, "chases t m 2"]]:
-    """Each chase up to `periods` control periods further, or to its end.
+    """Advance each chase by `periods` control periods, or to its end. The caller compiles this function.
 
-    **Arguments:** chase i is hunted by `strategy(parts[i])`, a pursuer; `begun` control periods have passed
-    before, in all of them; `keys` one random key a chase. To be compiled by the caller.
+    **Arguments:** the pursuer of chase i is `strategy(parts[i])`; `begun` control periods have passed before,
+    the same number in all chases; `keys` one random key per chase.
 
-    **Returns** the chases, and the wheel speeds (m/s) that were asked for, 0 after a chase's end.
+    **Returns** the chases, and the commanded wheel speeds (m/s), 0 after a chase's end.
     """
     count = chases.margin.shape[0]
 
@@ -143,11 +144,11 @@ def run_from(
 
 
 def shortfall(goal: str, chases: Chase) -> Float[Array, "chases"]:
-    """How far each chase is from what an attack wants, m; below 0 when it has it, or is sure to get it.
+    """Distance (m) of each chase from the attack's goal; below 0 when it is reached, or can be forced.
 
-    For a capture the margin h counts, since below 0 a capture can be forced, and faintly the clearance
-    itself, so that it then is. For a collision the clearance from obstacles counts, and faintly the margin,
-    since a pinned evader is one that can be steered.
+    For a capture this is the margin h, since below 0 a capture can be forced, with a small weight on the
+    clearance, so that it happens. For a collision it is the clearance from obstacles, with a small weight on
+    the margin, since a pinned evader can be steered.
     """
     capture = chases.margin + _FAINT * chases.tally.pursuer_clearance
     collision = chases.tally.obstacle_clearance + _FAINT * jnp.maximum(chases.margin, 0.0)

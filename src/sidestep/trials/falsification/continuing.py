@@ -1,4 +1,4 @@
-"""What does a search that is resumed go on with? Its own settings, and what is left of its time."""
+"""Resume a search: its stored settings, and the rest of its time."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _DEFAULT_MINUTES = 3.0
 
 
 def search_settings(folder: str | Path) -> dict[str, Any]:
-    """What `falsify` needs to go on with the search in `folder`: scenario, policy, shield and plan.
+    """The arguments with which `falsify` resumes the search in `folder`: scenario, policy, shield and plan.
 
-    A policy or a shield without a name is `custom` there, and must be given again.
+    A policy or shield without a name is stored as `custom`, and must be given again.
 
-    **Raises** `RunError` when there is none.
+    **Raises** `RunError` when the folder holds no search.
     """
     config = open_run(folder, "falsification", otherwise=NOT_BEGUN)
     return {
@@ -31,7 +31,7 @@ def search_settings(folder: str | Path) -> dict[str, Any]:
 
 
 def plan_for(config: Mapping[str, Any], plan: Plan | None) -> Plan:
-    """The plan of a search begun before, or the one given, with the certificate's clearance from there."""
+    """The stored plan of a search, or the given one with the stored certificate's clearance."""
     if plan is not None:
         if plan.guaranteed_clearance is not None:
             return plan
@@ -52,12 +52,12 @@ def check_policy(folder: Path, stored: Mapping[str, Any], policy: Mapping[str, A
 def budget_for(
     folder: Path, stored: Mapping[str, Any], before: float, minutes: float | None, episodes: int | None
 ) -> dict[str, Any]:
-    """What a search may take, all calls together: `minutes` (None: no limit) and `episodes` of each attack.
+    """The total budget of a search over all calls: `minutes` (None: no limit) and `episodes` per attack.
 
-    **Arguments:** `stored` what it was begun for, empty for a new one; `before` the seconds it has had;
-    `minutes`, on top of those, and `episodes` as asked for now.
+    **Arguments:** `stored` the budget it began with, empty for a new search; `before` the seconds used;
+    `minutes`, in addition to those, and `episodes` requested now.
 
-    **Raises** `RunError` when fewer episodes are asked for than before.
+    **Raises** `RunError` when fewer episodes are requested than before.
     """
     if minutes is None and episodes is None:
         if stored:

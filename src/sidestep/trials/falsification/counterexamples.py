@@ -1,4 +1,4 @@
-"""Counterexamples as small files that anyone can play again, and that nobody can change unnoticed."""
+"""Counterexamples as small files that can be replayed, with a digest that detects changes."""
 
 from __future__ import annotations
 
@@ -32,23 +32,22 @@ _NEEDED = (
     "time", "pursuer_clearance", "obstacle_clearance", "assumption", "words", "guaranteed_clearance",
 )  # fmt: skip
 CUSTOM = "custom"
-"""Name of a policy or shield that cannot be had by name."""
+"""Stands for a policy or shield without a name."""
 
 
 class CounterexampleError(ValueError):
-    """A counterexample that cannot be used: damaged, edited, or not to be played here."""
+    """A counterexample that cannot be used: damaged, edited, or without its policy or shield."""
 
 
 @dataclass(frozen=True)
 class Counterexample:
-    """An episode lost, by the start and the wheel speeds that led to it.
+    """A lost episode, given by its start and the pursuers' wheel speeds.
 
-    **Attributes:** `world` the start; `wheels (t, m, 2)` m/s, one row a control period; `end` evader and
-    pursuers at the end, to the last bit; `about` plain JSON values: `scenario` (its fields), `shield`,
-    `policy`, `seed`, `attack`, `version`, `dtype`, `limit` (periods for which it is played), `outcome`,
-    `steps`, `time` (s), `pursuer_clearance` and `obstacle_clearance` (least, m; null without such a robot),
-    the broken `assumption` (null: none) with `words`, and `guaranteed_clearance` (m) if a certificate gave
-    one.
+    **Attributes:** `world` the start; `wheels (t, m, 2)` m/s, one row per control period; `end` evader and
+    pursuers at the end, exact; `about` JSON values: `scenario` (its fields), `shield`, `policy`, `seed`,
+    `attack`, `version`, `dtype`, `limit` (control periods to play), `outcome`, `steps`, `time` (s),
+    `pursuer_clearance` and `obstacle_clearance` (least, m; null without such a robot), the broken
+    `assumption` (null: none) with `words`, and `guaranteed_clearance` (m) of a certificate, if any.
     """
 
     about: Mapping[str, Any]
@@ -59,7 +58,8 @@ class Counterexample:
 
 @dataclass(frozen=True)
 class Replay:
-    """A counterexample played again: `same` outcome in the same control period, `exact` to the last bit."""
+    """A replayed counterexample. `same`: same outcome in the same control period; `exact`: bitwise equal
+    end."""
 
     trajectory: Trajectory
     scenario: Scenario
@@ -75,7 +75,7 @@ def play(
     wheels: Float[np.ndarray, "t m 2"],
     limit: int,
 ) -> Trajectory:
-    """The episode that these wheel speeds (m/s) lead to, through the one control step there is."""
+    """The episode with these wheel speeds (m/s), computed by the control step of all episodes."""
     plan = np.zeros((limit, *wheels.shape[1:]), wheels.dtype)
     plan[: len(wheels)] = wheels[:limit]
     pursuer = Script(jnp.asarray(plan), jnp.zeros((), jnp.int32))
@@ -84,12 +84,12 @@ def play(
 
 
 def shield_name(shield: str | Shield, scenario: Scenario) -> str:
-    """The name under which `make_shield` gives this very shield, else `custom`."""
+    """The name with which `make_shield` returns this shield, else `custom`."""
     return shield if isinstance(shield, str) else name_of(shield, scenario) or CUSTOM
 
 
 def policy_digest(policy: LearnedPolicy) -> str:
-    """Digest of a trained policy's weights."""
+    """The digest of a trained policy's weights."""
     digest = hashlib.sha256(str(policy.decision_steps).encode())
     for leaf in jax.tree.leaves(eqx.filter(policy, eqx.is_array)):
         digest.update(np.ascontiguousarray(leaf).tobytes())
@@ -97,7 +97,7 @@ def policy_digest(policy: LearnedPolicy) -> str:
 
 
 def describe_policy(policy: Any, source: str | Path | None = None) -> dict[str, Any]:
-    """What a file says about a policy: its name, and for a trained one its run folder and digest."""
+    """A policy's description in a file: its name, and for a trained policy its run folder and digest."""
     if isinstance(policy, str):
         return {"name": policy}
     if isinstance(policy, LearnedPolicy):
@@ -108,7 +108,8 @@ def describe_policy(policy: Any, source: str | Path | None = None) -> dict[str, 
 def make_counterexample(
     scenario: Scenario, trajectory: Trajectory, wheels: Float[np.ndarray, "t m 2"], **about: Any
 ) -> Counterexample:
-    """The counterexample that `play` gave: `trajectory` from `wheels`; `about` what only the caller knows."""
+    """The counterexample of a `trajectory` that `play` returned for `wheels`; `about` is added to its
+    data."""
     steps = trajectory.length
     worlds = trajectory.worlds
     facts = {
@@ -129,7 +130,7 @@ def make_counterexample(
 
 
 def write_counterexample(path: str | Path, counterexample: Counterexample) -> None:
-    """Write it as one small `.npz` of plain arrays with a digest over all of it, whole or not at all."""
+    """Write it as an `.npz` of plain arrays with a digest of its content, whole or not at all."""
     text = json.dumps(counterexample.about, allow_nan=False, sort_keys=True)
     arrays = {
         "about": np.frombuffer(text.encode(), np.uint8),
@@ -141,7 +142,7 @@ def write_counterexample(path: str | Path, counterexample: Counterexample) -> No
 
 
 def read_counterexample(path: str | Path) -> Counterexample:
-    """What `write_counterexample` wrote.
+    """Read a file of `write_counterexample`.
 
     **Raises** `CounterexampleError` when the file is missing, damaged, edited or of another format.
     """
@@ -156,7 +157,7 @@ def read_counterexample(path: str | Path) -> Counterexample:
             raise CounterexampleError(f"{path} was written by another version of sidestep")
         missing = [name for name in _NEEDED if name not in about]
         if missing:
-            raise CounterexampleError(f"{path} does not say {', '.join(missing)}")
+            raise CounterexampleError(f"{path} lacks {', '.join(missing)}")
         with jax.enable_x64(about["dtype"] == "float64"):
             world = World(**{name: jnp.asarray(arrays[f"start_{name}"]) for name in WORLD_FIELDS})
         world = jax.tree.map(np.asarray, world)
@@ -173,12 +174,12 @@ def read_counterexample(path: str | Path) -> Counterexample:
 def replay(
     counterexample: Counterexample, *, policy: Any = None, shield: str | Shield | None = None
 ) -> Replay:
-    """Play a counterexample again through the same control step.
+    """Replay a counterexample with the control step of all episodes.
 
-    **Arguments:** `policy` and `shield` in place of those it names, which must be given where it names none
-    that can be had by name; a policy with other weights than its own is refused.
+    **Arguments:** `policy` and `shield`, by default those the counterexample names; required if it names
+    none. A trained policy must have the stored weights.
 
-    **Raises** `CounterexampleError` when policy or shield cannot be had or do not belong to it.
+    **Raises** `CounterexampleError` when policy or shield is unavailable or a different one.
     """
     about = counterexample.about
     with jax.enable_x64(about["dtype"] == "float64"):

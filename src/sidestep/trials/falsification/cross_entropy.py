@@ -1,4 +1,4 @@
-"""The cross-entropy method (Rubinstein, Kroese, 2004): draw, keep the best, draw around them."""
+"""The cross-entropy method (Rubinstein, Kroese, 2004): sample, keep the elites, sample around them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 
 class Search(eqx.Module):
-    """Size of a search: `population` drawn in each of `iterations`, of which `elites` are kept.
+    """Size of a search: `population` samples in each of `iterations`, of which `elites` are kept.
 
-    `least_spread` is the share of the first spread below which it never falls, so that a search that has
-    settled still looks around.
+    `least_spread` is the lower bound of the spread, as a share of the first one, so that a converged search
+    still explores.
     """
 
     population: int = eqx.field(static=True, default=64)
@@ -24,7 +24,8 @@ class Search(eqx.Module):
 
 
 class Optimum(eqx.Module):
-    """The best of `searches` independent searches: where, how good, and the best so far per iteration."""
+    """The best vector of each of `searches` independent searches, its score, and the best score per
+    iteration."""
 
     best: Float[Array, "searches n"]
     score: Float[Array, "searches"]
@@ -39,12 +40,12 @@ def minimise(
     search: Search,
     first: Float[Array, "searches n"] | None = None,
 ) -> Optimum:
-    """Vectors of low score, found by several searches side by side.
+    """Minimise a score by several searches in parallel.
 
-    **Arguments:** `evaluate` scores many vectors in one call (search by search), +inf for those not allowed;
-    `mean` and `spread` (standard deviation, per entry) where to begin; `first` vectors drawn for certain in
-    the first iteration (`mean` if not given). The best of each search is drawn again in its next iteration,
-    so that it never gets worse.
+    **Arguments:** `evaluate` returns the scores of many vectors (search by search), +inf for inadmissible
+    ones; `mean` and `spread` (standard deviation, per entry) of the first samples; `first` vectors that are
+    among the first samples (default `mean`). Each iteration includes the best vector so far, so the best
+    score never increases.
     """
     searches, size = mean.shape
     first = mean if first is None else first
@@ -59,7 +60,7 @@ def minimise(
         order = jnp.argsort(scores, axis=1)[:, : search.elites]
         elites = jnp.take_along_axis(drawn, order[..., None], axis=1)
         lowest = scores[jnp.arange(searches), order[:, 0]]
-        # Elites that are not allowed teach nothing.
+        # Inadmissible elites are ignored.
         taught = jnp.isfinite(jnp.take_along_axis(scores, order, axis=1)).all(axis=1)[:, None]
         mean = jnp.where(taught, jnp.mean(elites, axis=1), mean)
         narrow = jnp.maximum(jnp.std(elites, axis=1), search.least_spread * spread)

@@ -1,4 +1,4 @@
-"""A pursuer that learns to break the shield: TD3 on chases of the evader as it is, shield and all."""
+"""A pursuer that TD3 trains to capture the evader behind its shield."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ OBSERVATIONS = 16
 _BONUS, _PER_METRE, _FAR = 10.0, 10.0, 1.0
 
 
-class Lessons(eqx.Module):
-    """How the pursuer learns: it decides every `decision_steps` periods, in `chases` at once."""
+class PursuerTraining(eqx.Module):
+    """Options of the training: `chases` run at once, and the pursuer decides every `decision_steps`
+    periods."""
 
     algorithm: TD3
     chases: int = eqx.field(static=True, default=32)
@@ -36,32 +37,32 @@ class Lessons(eqx.Module):
 
 
 class Ring(eqx.Module):
-    """The last transitions; `written` counts all there ever were."""
+    """A ring buffer of transitions; `written` counts all transitions so far."""
 
     rows: Batch
     written: Int[Array, ""]
 
 
-class Pupil(eqx.Module):
-    """What is kept between lessons."""
+class TrainingState(eqx.Module):
+    """The state between rounds of training."""
 
     learner: Learner
     ring: Ring
 
 
-def new_pupil(lessons: Lessons, key: PRNGKeyArray) -> Pupil:
-    """A pursuer that has learned nothing."""
-    zeros = lambda *shape: jnp.zeros((lessons.capacity, *shape), real(0.0).dtype)  # noqa: E731
+def untrained(training: PursuerTraining, key: PRNGKeyArray) -> TrainingState:
+    """The state of an untrained pursuer."""
+    zeros = lambda *shape: jnp.zeros((training.capacity, *shape), real(0.0).dtype)  # noqa: E731
     rows = Batch(zeros(OBSERVATIONS), zeros(2), zeros(), zeros(OBSERVATIONS), zeros())
-    learner = lessons.algorithm.init(OBSERVATIONS, 2, key)
-    return Pupil(learner, Ring(rows, jnp.zeros((), jnp.int32)))
+    learner = training.algorithm.init(OBSERVATIONS, 2, key)
+    return TrainingState(learner, Ring(rows, jnp.zeros((), jnp.int32)))
 
 
-def look(scenario: Scenario, world: World) -> Float[Array, "observation"]:
-    """What a pursuer sees, in its own frame, scaled to about [-1, 1].
+def attacker_observation(scenario: Scenario, world: World) -> Float[Array, "observation"]:
+    """The observation of `world.pursuer` in its frame, scaled to about [-1, 1].
 
-    The evader's place, near and far, its margin h near and nearer still, its last velocity; the target and
-    the nearest obstacle as seen from the evader, and that obstacle's drift and clearance.
+    The evader's position on two scales, its margin h on three, its last velocity; positions of the target and
+    of the nearest obstacle relative to the evader, and that obstacle's velocity and clearance.
     """
     pose = world.pursuer
     z = to_pursuer_frame(world.evader, pose)
@@ -91,8 +92,8 @@ def look(scenario: Scenario, world: World) -> Float[Array, "observation"]:
 
 
 @final
-class _Held(Pursuer):
-    """Wheel speeds of all pursuers decided before, m/s; those of the first for whoever asks."""
+class _CommandedPursuers(Pursuer):
+    """Pursuers that drive given wheel speeds (m/s)."""
 
     wheels: Float[Array, "*batch m 2"]
 
@@ -103,8 +104,8 @@ class _Held(Pursuer):
         return self.wheels[0]
 
 
-def _promise(scenario: Scenario, world: World, goal: str) -> Scalar:
-    """How near the evader is to being lost, m, from below: what the pursuer is paid for lowering."""
+def _distance_to_goal(scenario: Scenario, world: World, goal: str) -> Scalar:
+    """The evader's margin or clearance (m), according to the goal; the pursuer's reward is its decrease."""
     margin = jnp.minimum(escape_margin(scenario, world), _FAR)
     gaps = norm(world.obstacles[:, :2] - world.evader) - scenario.collision_distance
     gap = jnp.min(gaps, initial=_FAR)
@@ -112,25 +113,30 @@ def _promise(scenario: Scenario, world: World, goal: str) -> Scalar:
 
 
 @eqx.filter_jit
-def lesson(
-    target: Target, lessons: Lessons, pupil: Pupil, worlds: World, goal: str, key: PRNGKeyArray
-) -> tuple[Pupil, Chase, Float[Array, "chases t m 2"]]:
-    """One chase from each start world, learning as it goes.
+def train(
+    target: Target,
+    training: PursuerTraining,
+    state: TrainingState,
+    worlds: World,
+    goal: str,
+    key: PRNGKeyArray,
+) -> tuple[TrainingState, Chase, Float[Array, "chases t m 2"]]:
+    """One chase from each start world, with training after every decision.
 
-    Reward: the decrease of what `_promise` measures, and a bonus for the loss. Chase i explores with noise of
-    standard deviation up to 0.6, the first with none.
+    Reward: the decrease of `_distance_to_goal`, and a bonus when the goal is reached. The exploration noise
+    of the chases has standard deviations from 0 (the first chase) to 0.6.
 
-    **Returns** what was learned, the chases at their ends and the wheel speeds (m/s) driven.
+    **Returns** the training state, the chases at their ends and the commanded wheel speeds (m/s).
     """
     scenario, count = target.scenario, worlds.time.shape[0]
-    m, steps = scenario.pursuer_count, lessons.decision_steps
-    loud = jnp.linspace(0.0, 0.6, count, dtype=worlds.time.dtype)
+    m, steps = scenario.pursuer_count, training.decision_steps
+    deviations = jnp.linspace(0.0, 0.6, count, dtype=worlds.time.dtype)
 
-    def sees(world: World) -> Float[Array, "m observation"]:
-        return jnp.stack([look(scenario, world.seen_by(index)) for index in range(m)])
+    def observe_all(world: World) -> Float[Array, "m observation"]:
+        return jnp.stack([attacker_observation(scenario, world.seen_by(index)) for index in range(m)])
 
     def drive(chase: Chase, wheels: Array, key: PRNGKeyArray) -> tuple[Chase, Float[Array, "t m 2"]]:
-        task = target.task(_Held(wheels))
+        task = target.task(_CommandedPursuers(wheels))
 
         def period(chase: Chase, key: PRNGKeyArray) -> tuple[Chase, Array]:
             deciding = chase.tally.steps % task.decision_steps == 0
@@ -139,56 +145,58 @@ def lesson(
 
         return jax.lax.scan(period, chase, jax.random.split(key, steps))
 
-    def decision(carry: tuple[Pupil, Chase], key: PRNGKeyArray) -> tuple[tuple[Pupil, Chase], Array]:
-        pupil, chases = carry
+    def decision(
+        carry: tuple[TrainingState, Chase], key: PRNGKeyArray
+    ) -> tuple[tuple[TrainingState, Chase], Array]:
+        state, chases = carry
         noise_key, drive_key, learn_key = jax.random.split(key, 3)
-        seen = jax.vmap(sees)(chases.world)
-        acted = pupil.learner.actor(seen.reshape(-1, OBSERVATIONS)).reshape(count, m, 2)
-        noise = loud[:, None, None] * jax.random.normal(noise_key, acted.shape, dtype=acted.dtype)
-        acted = jnp.clip(acted + noise, -1.0, 1.0)
+        seen = jax.vmap(observe_all)(chases.world)
+        actions = state.learner.actor(seen.reshape(-1, OBSERVATIONS)).reshape(count, m, 2)
+        noise = deviations[:, None, None] * jax.random.normal(noise_key, actions.shape, dtype=actions.dtype)
+        actions = jnp.clip(actions + noise, -1.0, 1.0)
         moved, wheels = jax.vmap(drive)(
-            chases, scenario.pursuer_speed * acted, jax.random.split(drive_key, count)
+            chases, scenario.pursuer_speed * actions, jax.random.split(drive_key, count)
         )
-        promise = jax.vmap(lambda world: _promise(scenario, world, goal))
-        lost = _lost(moved, goal)
-        reward = _PER_METRE * (promise(chases.world) - promise(moved.world)) + jnp.where(lost, _BONUS, 0.0)
+        distance = jax.vmap(lambda world: _distance_to_goal(scenario, world, goal))
+        bonus = jnp.where(_goal_reached(moved, goal), _BONUS, 0.0)
+        reward = _PER_METRE * (distance(chases.world) - distance(moved.world)) + bonus
         over = (~moved.running).astype(reward.dtype)
-        rows = Batch(seen[:, 0], acted[:, 0], reward, jax.vmap(sees)(moved.world)[:, 0], over)
-        ring = _remember(pupil.ring, rows, chases.running)
-        learner = _study(lessons, pupil.learner, ring, learn_key)
-        return (Pupil(learner, ring), moved), wheels
+        rows = Batch(seen[:, 0], actions[:, 0], reward, jax.vmap(observe_all)(moved.world)[:, 0], over)
+        ring = _append(state.ring, rows, chases.running)
+        learner = _updated(training, state.learner, ring, learn_key)
+        return (TrainingState(learner, ring), moved), wheels
 
     chases = jax.vmap(lambda world: begin(target, world))(worlds)
-    (pupil, chases), wheels = jax.lax.scan(
-        decision, (pupil, chases), jax.random.split(key, lessons.decisions)
+    (state, chases), wheels = jax.lax.scan(
+        decision, (state, chases), jax.random.split(key, training.decisions)
     )
     # (decisions, chases, steps, m, 2) to (chases, periods, m, 2)
-    return pupil, chases, jnp.swapaxes(wheels, 0, 1).reshape(count, -1, m, 2)
+    return state, chases, jnp.swapaxes(wheels, 0, 1).reshape(count, -1, m, 2)
 
 
-def _lost(chases: Chase, goal: str) -> Bool[Array, "chases"]:
+def _goal_reached(chases: Chase, goal: str) -> Bool[Array, "chases"]:
     captured, collided = chases.outcome == CAPTURED, chases.outcome == COLLIDED
     return captured if goal == "capture" else collided if goal == "collision" else captured | collided
 
 
-def _remember(ring: Ring, rows: Batch, running: Bool[Array, "chases"]) -> Ring:
+def _append(ring: Ring, rows: Batch, running: Bool[Array, "chases"]) -> Ring:
     capacity = ring.rows.reward.shape[0]
     place = (ring.written + jnp.cumsum(running) - 1) % capacity
-    place = jnp.where(running, place, capacity)  # beyond the end, and dropped there
+    place = jnp.where(running, place, capacity)  # out of range, and so dropped
     kept = jax.tree.map(lambda whole, row: whole.at[place].set(row, mode="drop"), ring.rows, rows)
     return Ring(kept, ring.written + jnp.sum(running).astype(ring.written.dtype))
 
 
-def _study(lessons: Lessons, learner: Learner, ring: Ring, key: PRNGKeyArray) -> Learner:
+def _updated(training: PursuerTraining, learner: Learner, ring: Ring, key: PRNGKeyArray) -> Learner:
     filled = jnp.minimum(ring.written, ring.rows.reward.shape[0])
 
     def one(learner: Learner, key: PRNGKeyArray) -> tuple[Learner, Any]:
         draw_key, update_key = jax.random.split(key)
-        places = jax.random.randint(draw_key, (lessons.batch_size,), 0, jnp.maximum(filled, 1))
+        places = jax.random.randint(draw_key, (training.batch_size,), 0, jnp.maximum(filled, 1))
         batch = jax.tree.map(lambda whole: whole[places], ring.rows)
-        return update(lessons.algorithm, learner, batch, update_key)[0], None
+        return update(training.algorithm, learner, batch, update_key)[0], None
 
-    def study(learner: Learner) -> Learner:
-        return jax.lax.scan(one, learner, jax.random.split(key, lessons.updates))[0]
+    def update_all(learner: Learner) -> Learner:
+        return jax.lax.scan(one, learner, jax.random.split(key, training.updates))[0]
 
-    return jax.lax.cond(filled >= lessons.batch_size, study, lambda learner: learner, learner)
+    return jax.lax.cond(filled >= training.batch_size, update_all, lambda learner: learner, learner)

@@ -1,5 +1,5 @@
-"""What has an attack learned, and where is it kept? Two files, so that a kill between any two writes leaves
-the one that belongs to the rounds in `metrics.jsonl`."""
+"""Store the state of an attack, in two files: after a kill between two writes, one of them matches the rounds
+in `metrics.jsonl`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _before(folder: Path, name: str) -> Path:
 
 
 def keep(folder: Path, name: str, state: Any, rows: dict[str, int], round: int) -> None:
-    """Store what an attack has learned by the end of a round (from 0); that of the one before stays."""
+    """Store an attack's state at the end of a round (from 0); that of the previous round is kept."""
     newest = _newest(folder, name)
     if round and newest.is_file():
         os.replace(newest, _before(folder, name))
@@ -29,9 +29,9 @@ def keep(folder: Path, name: str, state: Any, rows: dict[str, int], round: int) 
 
 
 def restored(folder: Path, name: str, fresh: Any, rounds: int) -> Any:
-    """What an attack had learned when its last of `rounds` rounds ended; `fresh` if none has.
+    """The attack's state after `rounds` rounds; `fresh` if there was none.
 
-    Where that is damaged or gone, what it had learned before, with a `DamageWarning`.
+    If it is damaged or missing, an earlier state, with a `DamageWarning`.
     """
     if fresh is None or not rounds:
         return fresh

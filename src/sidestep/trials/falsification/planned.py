@@ -1,4 +1,5 @@
-"""Attacks that plan: wheel speeds and start states found by cross-entropy, with the shield in the loop."""
+"""Planning attacks: wheel speeds and starts found by the cross-entropy method, with the shield in the
+loop."""
 
 from __future__ import annotations
 
@@ -19,10 +20,10 @@ from sidestep.world import World
 
 
 class Planning(eqx.Module):
-    """How an attack plans.
+    """Options of a planning attack, in control periods.
 
-    Wheel speeds are held for `hold` control periods; a plan spans `horizon` of them, of which `execute` are
-    driven before the next plan; a start is searched together with a first plan of `opening` periods.
+    Wheel speeds are held for `hold`; a plan spans `horizon`, of which `execute` are driven before the next
+    plan; a start is searched together with a first plan of `opening`.
     """
 
     search: Search
@@ -34,7 +35,7 @@ class Planning(eqx.Module):
 
 
 def _drive(target: Target, planning: Planning, knots: Array, periods: int) -> Float[Array, "n t m 2"]:
-    """Wheel speeds (m/s) of vectors of knots in units of V, cut to [-1, 1]."""
+    """Wheel speeds (m/s) of vectors of knots, which are in units of V and clipped to [-1, 1]."""
     m = target.scenario.pursuer_count
     levels = jnp.clip(knots, -1.0, 1.0).reshape(knots.shape[0], -1, m, 2)
     return target.scenario.pursuer_speed * jnp.repeat(levels, planning.hold, axis=1)[:, :periods]
@@ -43,9 +44,9 @@ def _drive(target: Target, planning: Planning, knots: Array, periods: int) -> Fl
 def _try(
     target: Target, chases: Chase, plans: Array, begun: Count, goal: str
 ) -> tuple[Float[Array, "n"], Chase]:
-    """How far from its goal each plan leaves its chase."""
+    """Each plan's `shortfall`, and the chases after it."""
     count, periods = plans.shape[:2]
-    keys = jax.random.split(jax.random.key(0), count)  # a plan draws nothing
+    keys = jax.random.split(jax.random.key(0), count)  # a plan needs no random numbers
     parts = (plans, jnp.broadcast_to(begun, (count,)))
     ended, _ = run(target, script, parts, forget(chases), begun, periods, keys)
     return shortfall(goal, ended), ended
@@ -64,9 +65,9 @@ def search_starts(
     goal: str,
     key: PRNGKeyArray,
 ) -> tuple[World, Float[Array, "searches knots"], Optimum]:
-    """From each of several start worlds, a better one and the knots of a plan to go with it.
+    """Improve each of several start worlds; returns them with the knots of their first plans.
 
-    **Arguments:** `freedom` as of `starts.freedom`.
+    **Arguments:** `freedom` from `starts.freedom`.
     """
     scenario, search = target.scenario, planning.start_search
     vectors = jax.vmap(lambda world: encode(scenario, world))(bases)
@@ -106,12 +107,12 @@ def plan_and_drive(
     goal: str,
     key: PRNGKeyArray,
 ) -> tuple[Chase, Float[Array, "chases t m 2"], Float[Array, "chases knots"], Float[Array, "chases"]]:
-    """Plan from where the chases are, drive the first part of the plans, and hand on the rest of them.
+    """Plan from the current state of the chases, and drive the first part of the plans.
 
-    **Arguments:** `knots` the plans that were left over, which are where the search begins.
+    **Arguments:** `knots` the rest of the previous plans, with which the search begins.
 
-    **Returns** the chases after `execute` control periods, the wheel speeds (m/s) driven, the plans left
-    over, and how far from the goal the plans would come.
+    **Returns** the chases after `execute` control periods, the commanded wheel speeds (m/s), the rest of the
+    plans, and the plans' `shortfall`.
     """
 
     def evaluate(drawn: Array) -> Array:
@@ -125,14 +126,14 @@ def plan_and_drive(
     parts = (driven, jnp.broadcast_to(begun, (count,)))
     chases, wheels = run(target, script, parts, chases, begun, planning.execute, keys)
     gone = planning.execute // planning.hold * 2 * target.scenario.pursuer_count
-    # What is added at the end goes on as the plan ended.
+    # The plan is extended by its last knots.
     last = found.best[:, -2 * target.scenario.pursuer_count :]
     rest = jnp.concatenate([found.best[:, gone:], jnp.tile(last, (1, planning.execute // planning.hold))], 1)
     return chases, wheels, rest, found.score
 
 
 def fit_knots(knots: Array, planning: Planning, pursuers: int) -> Float[Array, "chases knots"]:
-    """Knots of an opening, cut to a plan's horizon, or lengthened by their last ones."""
+    """Knots of an opening, truncated to a plan's horizon or extended by their last ones."""
     wanted = 2 * pursuers * (planning.horizon // planning.hold)
     missing = max(0, wanted - knots.shape[1])
     last = knots[:, -2 * pursuers :]
@@ -148,7 +149,7 @@ def chase_with_plans(
     goal: str,
     key: PRNGKeyArray,
 ) -> tuple[Chase, Float[np.ndarray, "chases t m 2"]]:
-    """Plan, drive and plan again, until every chase has ended or `periods` have passed."""
+    """Plan and drive in turn until every chase has ended or `periods` have passed."""
     chases = jax.vmap(lambda world: begin(target, world))(worlds)
     knots = fit_knots(knots, planning, target.scenario.pursuer_count)
     driven = []

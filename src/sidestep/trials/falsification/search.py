@@ -1,4 +1,4 @@
-"""The search for counterexamples: attacks in turn until the time is over, everything found kept on disk."""
+"""The search for counterexamples: attacks in turn until the time is over, with all findings on disk."""
 
 from __future__ import annotations
 
@@ -64,8 +64,7 @@ _DEEPER = 1e-4
 def check_plan(
     scenario: Scenario, plan: Plan, minutes: float | None = None, episodes: int | None = None
 ) -> None:
-    """**Raises** `ValueError` naming what cannot be searched for, or not for so long, its value and what is
-    allowed."""
+    """**Raises** `ValueError` naming an invalid field of the plan or limit, its value and what is allowed."""
     check(plan)
     for name, value, bound in (("minutes", minutes, DURATION), ("episodes", episodes, EPISODES)):
         if value is not None:
@@ -95,24 +94,29 @@ def falsify(
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Falsification:
-    """Search for a pursuer, and a start, that captures the evader or makes it collide.
+    """Search for a pursuer and a start with which the evader is captured or collides.
 
-    Attacks take turns, the one that has had the least time next; everything in round r of an attack follows
-    from the seed, the attack and r, whatever else was searched. Whatever loses the evader is played again
-    alone, through the one control step, before it is believed and kept (see `Plan.most`).
+    Attacks take turns; the one with the least time so far is next. Round r of an attack depends only on the
+    seed, the attack and r. A lost chase is replayed alone through the control step, and kept only if it is
+    lost again (see `Plan.most`).
 
-    **Arguments:** `policy` `goal-seeking`, a run folder or any policy; `shield` a name or a `Shield`; `out`
-    the folder to write, held until the last file is written; `minutes` to search for (3 unless `episodes` is
-    given), when resuming on top of the time it has had; `episodes` after which an attack ends; `resume` to go
-    on with the search in `out`, whose settings must be the ones given (`search_settings` reads them; its plan
-    is used if none is given), for what is left of the time or the episodes it was begun for if neither is
-    given; `progress` is called after each round.
+    **Arguments:**
 
-    Ctrl-C ends the search with what it has found.
+    - `policy`: `goal-seeking`, a run folder or any policy
+    - `shield`: a name or a `Shield`
+    - `out`: the folder to write, locked until the last file is written
+    - `minutes`: duration of the search (3 unless `episodes` is given); on resuming, in addition to the time
+      already used
+    - `episodes`: after which an attack ends
+    - `resume`: continue the search in `out`. The settings must equal the stored ones (`search_settings` reads
+      them; the stored plan is the default). Without `minutes` and `episodes` the rest of the stored budget
+      is used
+    - `progress`: called after each round
 
-    **Raises** `ValueError` for settings that make no sense (see `check_plan`), robots that are not the
-    built-in ones, or a folder that is taken or cannot be resumed so; `FolderInUseError` when someone else
-    writes there.
+    Ctrl-C ends the search and keeps its results.
+
+    **Raises** `ValueError` for invalid settings (see `check_plan`), robots other than the built-in ones, or a
+    folder that is occupied or cannot be resumed; `FolderInUseError` when another process writes there.
     """
     folder = Path(out)
     source = policy if isinstance(policy, (str, Path)) else None
@@ -145,20 +149,20 @@ def falsify(
             create_run(folder, about)
         for name in ("counterexamples", "checkpoints", "figures"):
             make_folder(folder / name)
-        hunt = _Hunt(folder, target, shield_called, about, plan, progress)
+        search = _RunningSearch(folder, target, shield_called, about, plan, progress)
         if stored is not None:
-            about["budget"] = budget_for(folder, stored.get("budget", {}), hunt.before, minutes, episodes)
+            about["budget"] = budget_for(folder, stored.get("budget", {}), search.before, minutes, episodes)
             if about["budget"] != stored.get("budget"):
                 write_json(folder / "config.json", about)
-        return hunt.run()
+        return search.run()
 
 
 def _load(source: str | Path) -> Any:
     return source if source == GOAL_SEEKING else load_policy(source)
 
 
-class _Hunt:
-    """The search while it runs."""
+class _RunningSearch:
+    """The state of a running search."""
 
     def __init__(
         self,
@@ -178,7 +182,7 @@ class _Hunt:
         for line in read_metrics(folder):
             self.tallies[line["attack"]].add(line)
         self.before = sum(tally.seconds for tally in self.tallies.values())
-        # Rounds count from 0; the last number is left for what an attack begins with.
+        # Rounds count from 0; the last number is reserved for the initial state.
         self.states = {
             name: learned.restored(
                 folder, name, self.attacks[name].init(self._key(name, 2**31 - 1)), self.tallies[name].rounds
@@ -189,7 +193,7 @@ class _Hunt:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of search, those before a resume included."""
+        """Seconds of search, including those before a resume."""
         return self.before + time.perf_counter() - self.began
 
     def _key(self, name: str, number: int) -> Any:
@@ -198,7 +202,7 @@ class _Hunt:
 
     @_interrupts.held()
     def run(self) -> Falsification:
-        """Rounds until the time is over or every attack has played its episodes."""
+        """Run rounds until the time is over or every attack has played its episodes."""
         minutes, episodes = self.about["budget"]["minutes"], self.about["budget"]["episodes"]
         budget = None if minutes is None else 60.0 * minutes
         interrupted, rounds = False, 0
@@ -237,7 +241,7 @@ class _Hunt:
         return f"Kept: {rounds} rounds of the search and {found} counterexamples in {self.folder}"
 
     def _ended_before(self) -> dict[str, Any] | None:
-        """The summary of a search that had come to its end; None if it is not there."""
+        """The summary if the search had already ended, else None."""
         try:
             summary = read_summary(self.folder)
         except RunError:
@@ -273,7 +277,7 @@ class _Hunt:
         tally.add(line)
 
     def _keep(self, name: str, result: Round) -> tuple[list[dict[str, Any]], int]:
-        """Play the lost chases again, the deepest first, and keep those worth it."""
+        """Replay the lost chases, the deepest first, and keep those that `Plan.most` allows."""
         kept: list[dict[str, Any]] = []
         unconfirmed = 0
         for outcome in _WANTED[self.plan.goal]:
@@ -294,7 +298,7 @@ class _Hunt:
         return kept, unconfirmed
 
     def _examine(self, name: str, result: Round, number: int) -> Counterexample | None:
-        """The counterexample of a lost chase; None if it is not lost when played alone (rounding)."""
+        """The counterexample of a lost chase; None if its replay is not lost (rounding)."""
         world = jax.tree.map(lambda leaf: leaf[number], result.starts)
         wheels = result.wheels[number, : result.steps[number]]
         scenario, guaranteed = self.target.scenario, self.plan.guaranteed_clearance
@@ -320,8 +324,8 @@ class _Hunt:
     def _store(self, name: str, number: int, found: Counterexample) -> dict[str, Any]:
         file = f"counterexamples/{name}-{self.tallies[name].rounds:04d}-{number:03d}.npz"
         write_counterexample(self.folder / file, found)
-        told = ("outcome", "time", "pursuer_clearance", "obstacle_clearance", "assumption", "words")
-        return {"file": file, "attack": name, "at": self.elapsed, **{key: found.about[key] for key in told}}
+        names = ("outcome", "time", "pursuer_clearance", "obstacle_clearance", "assumption", "words")
+        return {"file": file, "attack": name, "at": self.elapsed, **{key: found.about[key] for key in names}}
 
     def _summary(self, interrupted: bool) -> dict[str, Any]:
         attacks = {}

@@ -1,4 +1,4 @@
-"""Start worlds to attack from: drawn by the scenario, at the edge of the capture set, or searched for."""
+"""Start worlds of attacks: drawn by the scenario, at the edge of the capture set, or searched."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
 
 LEAST_MARGIN = 1e-5
-"""Starts that are searched for stay at least this far (m) outside the capture set."""
+"""Least distance (m) of searched starts from the capture set."""
 EDGE = 1e-3
-"""Starts at the edge have a margin h of at most this, m."""
+"""Largest margin h (m) of starts at the edge."""
 _CLEAR = 1e-3
 _NEAR_AXIS = 0.1
 _WITHIN_EDGE = 3
@@ -25,7 +25,7 @@ _WITHIN_EDGE = 3
 def admissible(scenario: Scenario, world: World) -> Flag:
     """Whether an episode may start here: outside the capture set and the obstacles, the target not reached.
 
-    `Scenario.accepts` without the separations of the random distribution.
+    As `Scenario.accepts`, but without the separations of random starts.
     """
     free = eqx.tree_at(
         lambda s: (s.initial_separation, s.obstacle_separation, s.target_separation),
@@ -36,7 +36,7 @@ def admissible(scenario: Scenario, world: World) -> Flag:
 
 
 def starts_are_free(scenario: Scenario) -> bool:
-    """Whether the user fixed nothing about the start, so that an attack may choose all of it."""
+    """Whether the scenario fixes no part of the start, so that an attack may choose all of it."""
     starts = (
         scenario.evader_start, scenario.pursuer_starts, scenario.obstacle_starts, scenario.target_start,
     )  # fmt: skip
@@ -44,10 +44,10 @@ def starts_are_free(scenario: Scenario) -> bool:
 
 
 def encode(scenario: Scenario, world: World) -> Float[Array, "n"]:
-    """A start world as a vector, seen from the evader, whose own place does not matter.
+    """A start world as a vector, relative to the evader's position.
 
-    Per pursuer the margin h (m), the evader's bearing in its frame and its heading (rad); the target's angle
-    (rad) and distance (m); per obstacle its angle, distance and the direction of its drift.
+    Per pursuer: margin h (m), the evader's bearing in its frame (rad), its heading (rad). Target: angle (rad)
+    and distance (m). Per obstacle: angle (rad), distance (m) and direction of its velocity (rad).
     """
 
     def pursuer(pose: Array) -> Array:
@@ -63,7 +63,8 @@ def encode(scenario: Scenario, world: World) -> Float[Array, "n"]:
 
 
 def decode(scenario: Scenario, base: World, vector: Float[AnyArray, "n"]) -> World:
-    """The start world that `vector` says, around the evader of `base`; pursuers never closer than allowed."""
+    """The start world of a vector of `encode`, with the evader of `base`. Pursuers keep the least
+    distance."""
     m, k = scenario.pursuer_count, scenario.obstacle_count
     vector = real(vector)
 
@@ -94,10 +95,10 @@ def decode(scenario: Scenario, base: World, vector: Float[AnyArray, "n"]) -> Wor
 
 
 def freedom(scenario: Scenario, *, edge: bool) -> Float[np.ndarray, "n"]:
-    """How far (standard deviation) a search may first move each entry of `encode`; 0 for what is fixed.
+    """The initial spread (standard deviation) of a search over each entry of `encode`; 0 for fixed entries.
 
-    With `edge` the margin is searched within a millimetre and the bearing close by. Where the user fixed any
-    start, all of it is as the scenario draws it.
+    With `edge` the margin is searched within 1 mm and the bearing nearby. If the scenario fixes any part of
+    the start, all entries are fixed.
     """
     m, k = scenario.pursuer_count, scenario.obstacle_count
     pursuer = np.array([0.5 * EDGE, 0.5 * _NEAR_AXIS, 1.0] if edge else [0.2, 0.6, 1.5])
@@ -109,12 +110,10 @@ def freedom(scenario: Scenario, *, edge: bool) -> Float[np.ndarray, "n"]:
 
 
 def at_edge(scenario: Scenario, base: World, key: PRNGKeyArray) -> World:
-    """A start with a margin h of at most a millimetre towards every pursuer.
+    """A start with a margin h of at most 1 mm towards every pursuer.
 
-    Half of them lie near the pursuer's axis, a quarter straight to its side, the rest anywhere.
-
-    All else is as in `base`, a start that the scenario drew, and everything is where the user fixed any
-    start.
+    Half of them lie near the pursuer's axis, a quarter beside it, the rest at any bearing. All else is as in
+    `base`, a start drawn by the scenario. If the scenario fixes any part of the start, `base` is returned.
     """
     if not starts_are_free(scenario):
         return base
@@ -133,7 +132,7 @@ def at_edge(scenario: Scenario, base: World, key: PRNGKeyArray) -> World:
         vector = vector.at[places].set(h).at[places + 1].set(bearing)
         return decode(scenario, base, vector)
 
-    # Where the edge lies inside an obstacle, another draw; the scenario's own start if none will do.
+    # Draw again while the start is inadmissible, as in an obstacle; `base` if none is found.
     worlds = jax.vmap(draw)(jax.random.split(key, _WITHIN_EDGE))
     good = jax.vmap(lambda world: admissible(scenario, world))(worlds)
     chosen = jax.tree.map(lambda leaf: leaf[jnp.argmax(good)], worlds)
@@ -142,7 +141,7 @@ def at_edge(scenario: Scenario, base: World, key: PRNGKeyArray) -> World:
 
 @eqx.filter_jit
 def draw_starts(scenario: Scenario, keys: Key[Array, "n"], edge: AnyArray) -> World:
-    """One start a key, at the edge of the capture set where `edge` says so."""
+    """One start per key; at the edge of the capture set where `edge` is set."""
 
     def draw(key: PRNGKeyArray, edge: Array) -> World:
         base_key, edge_key = jax.random.split(key)

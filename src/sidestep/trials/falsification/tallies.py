@@ -1,4 +1,4 @@
-"""What a search is told, what it counts, and what it gives back."""
+"""The plan, the counts and the result of a search."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ COUNTERS = (
     "unconfirmed",
     "pursuer_invalid",
 )
-"""What a `Tally` adds up over rounds."""
+"""Fields that a `Tally` sums over rounds."""
 LEAST = ("pursuer_clearance", "obstacle_clearance", "margin")
-"""What a `Tally` keeps the least of."""
+"""Fields of which a `Tally` keeps the minimum."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is searched for, and how: everything that a resumed search must not change.
+    """The settings of a search, which a resume must not change.
 
     `batch` chases or plans at once; `seconds` the longest chase; `most` counterexamples kept per attack and
-    outcome (more only if they get 0.1 mm deeper, or broke no assumption).
+    outcome (more only if they are 0.1 mm deeper, or broke no assumption).
     """
 
     seed: int = bounded(0, SEED)
@@ -46,8 +46,8 @@ class Plan:
 
 @dataclass
 class Tally:
-    """What one attack has come to. Clearances and margin: the least, m. `first` s into the search;
-    `pursuer_invalid` periods in which an attack's wheel speeds were not finite."""
+    """The totals of one attack. Clearances and margin: the least, m. `first`: time (s) of the first
+    counterexample; `pursuer_invalid`: control periods in which the attack's wheel speeds were not finite."""
 
     rounds: int = 0
     episodes: int = 0
@@ -64,7 +64,7 @@ class Tally:
     kept: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, line: Mapping[str, Any]) -> None:
-        """Count one round, as its line in `metrics.jsonl` says."""
+        """Add one round, given by its line of `metrics.jsonl`."""
         for name in COUNTERS:
             setattr(self, name, getattr(self, name) + (1 if name == "rounds" else line.get(name, 0)))
         for name in LEAST:
@@ -75,7 +75,7 @@ class Tally:
             self.first = line["at"]
 
     def deepest(self, outcome: str) -> tuple[int, float]:
-        """How many counterexamples with this outcome are kept, and the least clearance among them."""
+        """The number of counterexamples kept with this outcome, and the least clearance (m) among them."""
         name = clearance_of(outcome)
         depths = [entry[name] for entry in self.kept if entry["outcome"] == outcome]
         return len(depths), min(depths, default=np.inf)
@@ -83,7 +83,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the search is: the attack that has just played a round, its tally, and all of them."""
+    """The progress of a search: the attack that has just finished a round, its tally, and all tallies."""
 
     attack: str
     tally: Tally
@@ -99,9 +99,9 @@ class Progress:
 
 @dataclass(frozen=True)
 class Falsification:
-    """A search and what it found. `folder/counterexamples` holds one file per counterexample kept.
+    """The result of a search. `folder/counterexamples` holds one file per counterexample kept.
 
-    `had_ended`: it was resumed, but had had its time or its episodes.
+    `had_ended`: the search was resumed but had already used its time or its episodes.
     """
 
     folder: Path
@@ -112,17 +112,17 @@ class Falsification:
 
     @property
     def counterexamples(self) -> list[Path]:
-        """Files of the counterexamples kept, in the order in which they were found."""
+        """Files of the counterexamples kept, in the order of discovery."""
         entries = [entry for tally in self.tallies.values() for entry in tally.kept]
         return [self.folder / entry["file"] for entry in sorted(entries, key=lambda entry: entry["at"])]
 
     @property
     def inside(self) -> list[Path]:
-        """Files of those that broke no assumption."""
+        """Files of the counterexamples that broke no assumption."""
         entries = [entry for tally in self.tallies.values() for entry in tally.kept]
         return [self.folder / entry["file"] for entry in entries if entry["assumption"] is None]
 
 
 def clearance_of(outcome: str) -> str:
-    """Which clearance says how deep an outcome went."""
+    """The name of the clearance that measures the depth of an outcome."""
     return "pursuer_clearance" if outcome == "captured" else "obstacle_clearance"

@@ -1,4 +1,4 @@
-"""Which assumption of a shield's guarantee a counterexample broke, if any."""
+"""Judge a counterexample: which assumption of the shield's guarantee it broke, if any."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ ASSUMPTIONS: dict[str, str] = {
     "slow-obstacles": "obstacles are slower than the evader",
     "alone": "the rows towards pursuer and obstacles can be kept together",
 }
-"""What each shield's guarantee takes for granted, by the names that verdicts use."""
+"""The assumptions of the shields' guarantees, by the names that verdicts use."""
 
 _ROUNDING = 8.0
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Why a counterexample could happen: the `assumption` it broke (a key of `ASSUMPTIONS`), and how.
+    """The `assumption` (a key of `ASSUMPTIONS`) that a counterexample broke, and how.
 
-    None means that it broke none: theory or code is wrong.
+    None means that it broke none: then theory or code is wrong.
     """
 
     assumption: str | None
@@ -46,19 +46,19 @@ class Verdict:
 
     @property
     def inside(self) -> bool:
-        """Whether it happened inside the shield's assumptions."""
+        """Whether all of the shield's assumptions held."""
         return self.assumption is None
 
 
 def judge(
     scenario: Scenario, shield: str, trajectory: Trajectory, guaranteed_clearance: float | None = None
 ) -> Verdict:
-    """The assumption that an episode lost under `shield` broke.
+    """The assumption that a lost episode under `shield` broke.
 
-    **Arguments:** `guaranteed_clearance` what a certificate for this control period promises as the least
-    clearance from the pursuer, m (below 0: the evader may be caught, but never deeper than that); without
-    one, sampling excuses a capture when the control period is longer than half of T_est = 2 b m/(V l),
-    m = b rho - l tan S, up to which none was ever seen.
+    **Arguments:** `guaranteed_clearance` the least clearance (m) from the pursuer that a certificate
+    guarantees at this control period (below 0: a capture may happen, but not deeper). Without it, a capture
+    counts as broken by `sampling` when the control period exceeds T_est/2, with T_est = 2 b m/(V l) and
+    m = b rho - l tan S; up to that period no capture has been observed.
 
     **Raises** `ValueError` for an episode that ended neither in a capture nor in a collision.
     """
@@ -69,7 +69,7 @@ def judge(
         return Verdict("promise", "there is no shield")
     if shield not in ("paper", *PURSUIT_SHIELDS):
         return Verdict("promise", f"nothing is known of what the shield {shield!r} promises")
-    common = _before_all_else(scenario, trajectory)
+    common = _judge_input(scenario, trajectory)
     if common is not None:
         return common
     if outcome == "collided":
@@ -80,10 +80,10 @@ def judge(
 
 
 def certified_clearance(scenario: Scenario, shield: str) -> float | None:
-    """The least clearance (m) from the pursuer that `shield` is computed to keep at this control period.
+    """The certified least clearance (m) from the pursuer under `shield` at this control period.
 
-    Below 0 where a pursuer may get in between two decisions of the shield. None where there is nothing to
-    compute: another shield, several pursuers, a pursuer that wins. Takes seconds.
+    Below 0 if a pursuer may capture between two decisions of the shield. None if there is no certificate:
+    another shield, several pursuers, or a pursuer that wins the game. Takes seconds.
     """
     escapes = bool(CaptureGame.of(scenario).evader_can_escape)
     if shield not in PURSUIT_SHIELDS or scenario.pursuer_count != 1 or not escapes:
@@ -92,7 +92,7 @@ def certified_clearance(scenario: Scenario, shield: str) -> float | None:
     return kept.level - kept.error - float(scenario.capture_distance)
 
 
-def _before_all_else(scenario: Scenario, trajectory: Trajectory) -> Verdict | None:
+def _judge_input(scenario: Scenario, trajectory: Trajectory) -> Verdict | None:
     start: World = jax.tree.map(lambda leaf: leaf[0], trajectory.worlds)
     h = float(escape_margin(scenario, start))
     if h <= 0.0:
@@ -160,14 +160,14 @@ def _judge_capture(scenario: Scenario, trajectory: Trajectory, guaranteed: float
 
 
 def _exact(trajectory: Trajectory) -> float:
-    """How exactly distances are known in the numbers' precision, m."""
+    """Rounding error (m) of distances in the floating-point precision."""
     evader = np.asarray(trajectory.worlds.evader)
     extent = float(np.max(np.abs(evader), initial=1.0))
     return _ROUNDING * float(np.finfo(evader.dtype).eps) * extent
 
 
 def _safe_period(scenario: Scenario, game: CaptureGame) -> float:
-    """T_est/2 in s; infinite for an evader at least as fast."""
+    """T_est/2 in s, see `judge`; infinite for an evader at least as fast as the pursuer."""
     usable, axle = float(game.usable_angle), float(game.half_axle)
     speed, reach = float(game.pursuer_speed), float(game.capture_distance)
     spare = axle * np.cos(usable) - reach * np.tan(usable)

@@ -1,4 +1,4 @@
-"""Episodes on their way, many at once in lanes: begun, advanced, and written down when they end."""
+"""Run many episodes at once in lanes. A lane whose episode has ended begins the next one."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from sidestep.loop.step import RUNNING
 from sidestep.world import Scenario, World
 
 _CHUNK_STEPS = 200
-_THOUGHTFUL_STEPS = 20
-"""Periods between two looks at what has ended, and at Ctrl-C; behind a shield that thinks ahead a tenth."""
+_LOOK_AHEAD_STEPS = 20
+"""Control periods between two checks for ended episodes and for Ctrl-C; less for a shield that looks ahead,
+which is slower."""
 Read = Callable[[Any, Scenario, Period], Any]
-"""What a caller reads of each control period: `read(kept, scenario, period)` is what is kept from then on."""
+"""A caller's fold over control periods: `read(kept, scenario, period)` returns the new `kept`."""
 
 
 class Slots(eqx.Module):
-    """Episodes in lanes, and the `number` of each; negative where a slot is empty."""
+    """Episodes in lanes, and the `number` of each; negative for an empty slot."""
 
     number: Int[Array, "batch"]
     episode: Episode
@@ -34,19 +35,19 @@ class Slots(eqx.Module):
 
 @eqx.filter_jit
 def _starts(scenario: Scenario, key: PRNGKeyArray, numbers: Int[Array, "batch"]) -> World:
-    """The worlds in which these episodes start."""
+    """The start worlds of these episodes."""
     starts = jax.vmap(lambda number: scenario.reset(start_and_pursuit(episode_key(key, number))[0]))(numbers)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
 
 
 @eqx.filter_jit
 def _refill(shield: Any, slots: Slots, numbers: Int[Array, "batch"], worlds: World) -> Slots:
-    """Slot i becomes episode `numbers[i]` at its start, unless that is negative."""
+    """Begin episode `numbers[i]` in slot i, unless that is negative."""
     return select(numbers >= 0, Slots(numbers, begin(shield, worlds)), slots)
 
 
 def _empty_slots(shield: Any, worlds: World, size: int) -> Slots:
-    """Slots in which nothing runs."""
+    """Empty slots."""
     shapes = eqx.filter_eval_shape(begin, shield, worlds)
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return Slots(jnp.zeros(size, jnp.int32), empty)
@@ -56,7 +57,7 @@ def _empty_slots(shield: Any, worlds: World, size: int) -> Slots:
 def _advance(
     task: Task, key: PRNGKeyArray, slots: Slots, decisions: Count, kept: Any, read: Read | None
 ) -> tuple[Slots, Any]:
-    """Every running episode by up to `decisions` decisions; stops early when none is running."""
+    """Advance every running episode by up to `decisions` decisions; stops early when none is running."""
 
     def period_key(number: Array, steps: Array) -> PRNGKeyArray:
         return jax.random.fold_in(start_and_pursuit(episode_key(key, number))[1], steps)
@@ -81,9 +82,9 @@ def _advance(
 
 @dataclass(frozen=True)
 class Trial:
-    """What all episodes of an evaluation have in common: `width` of them run at once, in each crew.
+    """What all episodes of an evaluation share. Each `EpisodeBatch` runs `width` of them at once.
 
-    With `read`, each crew starts with `kept` and reads every control period, see `Read`.
+    With `read`, each batch folds it over its control periods, beginning with `kept`; see `Read`.
     """
 
     task: Task
@@ -94,14 +95,14 @@ class Trial:
 
 
 @final
-class Crew:
-    """The episodes `begin` to `end` of a trial, `trial.width` at once, in the order of their numbers.
+class EpisodeBatch:
+    """The episodes `begin` to `end` of a trial, `trial.width` at once, in order of their numbers.
 
-    There is one width for any number of episodes, slots being refilled as they fall free: each width would
-    compile anew, which takes longer than ten thousand episodes.
+    The width does not depend on the number of episodes, and free slots are refilled: each width compiles
+    separately, which takes longer than ten thousand episodes.
 
-    **Attributes:** `results`, by episode: `outcome` and the parts of a `Tally` by name; `sums` of what was
-    read, 0 without.
+    **Attributes:** `results` per episode: `outcome` and the fields of `Tally` by name; `sums`, the result of
+    `trial.read`, 0 without.
     """
 
     def __init__(self, trial: Trial, begin: int, end: int):
@@ -113,18 +114,18 @@ class Crew:
         self.sums: Any = 0.0
 
     def get_ready(self) -> None:
-        """Compile all that it takes, and begin the first episodes."""
+        """Compile, and begin the first episodes."""
         self._refill()
-        self._go_on(0)
+        self._run(0)
 
     def __iter__(self) -> Iterator[int]:
-        """Run everything; yields now and then how many more episodes have ended."""
+        """Run all episodes; yields the number of episodes ended since the last yield."""
         task = self._trial.task
-        thoughtful = getattr(task.shield, "looks_ahead", False)
-        steps = _THOUGHTFUL_STEPS if thoughtful else _CHUNK_STEPS
+        looks_ahead = getattr(task.shield, "looks_ahead", False)
+        steps = _LOOK_AHEAD_STEPS if looks_ahead else _CHUNK_STEPS
         while self._next < self._end or np.any(self._numbers >= 0):
             self._refill()
-            yield self._go_on(max(1, steps // task.decision_steps))
+            yield self._run(max(1, steps // task.decision_steps))
 
     def _refill(self) -> None:
         trial = self._trial
@@ -139,12 +140,12 @@ class Crew:
         self._numbers[free] = fresh[free]
         self._next += len(free)
 
-    def _go_on(self, decisions: int) -> int:
+    def _run(self, decisions: int) -> int:
         assert self._slots is not None
         trial, count = self._trial, jnp.asarray(decisions, jnp.int32)
         self._slots, sums = _advance(trial.task, trial.key, self._slots, count, trial.kept, trial.read)
         if trial.read is not None:
-            # Single precision is enough for one chunk, not for a long trial.
+            # float32 suffices for one chunk, but not for a long trial.
             self.sums = self.sums + np.asarray(sums, np.float64)
         episode = self._slots.episode
         ended = np.flatnonzero(~np.asarray(episode.running) & (self._numbers >= 0))
