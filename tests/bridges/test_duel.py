@@ -117,5 +117,5 @@ def test_several_pursuers_share_what_the_evader_loses_and_each_has_its_own_wheel
 
 
 def test_a_strategy_for_the_pursuers_is_refused():
-    with pytest.raises(ValueError, match="learners"):
+    with pytest.raises(ValueError, match="in DuelEnv the pursuers learn"):
         duel.DuelEnv(pursuer="nash")

@@ -1,1 +1,1 @@
-"""Where does it meet other software? Each bridge needs the packages of its own extra."""
+"""Interfaces to other software. Each bridge needs the packages of its extra."""

@@ -1,4 +1,4 @@
-"""A campaign over the cores of this machine or of many, by Dask; one Parquet table (extra `cluster`)."""
+"""Campaigns on one machine or on a cluster, with Dask; results as a Parquet table (extra `cluster`)."""
 
 from sidestep.bridges.campaigns.campaign import CampaignOutcome, Failure, run_campaign
 from sidestep.bridges.campaigns.table import write_table

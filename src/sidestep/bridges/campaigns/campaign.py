@@ -1,4 +1,4 @@
-"""How does a campaign get done? Workers are handed one job each; what is there already is not run again."""
+"""Run a campaign on Dask workers, one job per worker at a time. Jobs that have a result are not run again."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from sidestep.trials.campaign import Campaign, Job, Task
 
 _LOOK_SECONDS = 1.0
-"""How often to look for new and lost workers while no job ends."""
+"""Seconds between two checks for new and lost workers while no job ends."""
 _RESULT_SECONDS = 60.0
-"""How long a worker may take to hand over a result that it says it has."""
+"""Seconds a worker may take to send a finished result."""
 _MOST_DEATHS = 3
-"""Workers that may die under one job."""
+"""A job fails when this many workers have died while running it."""
 Show = Callable[[int, int, str], None]
 
 
@@ -39,12 +39,17 @@ class Failure:
 
 @dataclass
 class CampaignOutcome:
-    """What became of a campaign's jobs.
+    """The outcome of a campaign's jobs.
 
-    **Attributes:** `jobs` asked for; `earlier` of them were there already; `ran` ended with a result now;
-    `failed` did not; `damaged` result files were set aside since the folder was begun; `lost_workers` were
-    there and then not; `stopped` is why it ended before its end, None if it did not; `seconds` from the first
-    worker to the last result; `rows` as `campaign_rows` makes them of all results.
+    **Attributes:**
+
+    - `jobs` of the campaign; `earlier`: those that already had a result; `ran`: those that got one now
+    - `failed` jobs, with the reason
+    - `damaged` result files, set aside since the folder was created
+    - `lost_workers`: workers that disappeared
+    - `stopped`: why the call ended early; None if it did not
+    - `seconds` from the first worker to the last result
+    - `rows` of all results, see `campaign_rows`
     """
 
     jobs: int
@@ -86,18 +91,21 @@ def run_campaign(
 ) -> CampaignOutcome:
     """Run the jobs of a campaign that have no result in `folder` yet, and write `results.parquet` there.
 
-    A job whose worker dies is run again, on another worker and after the others of its kind; one under which
-    three have died has failed, and takes no other with it. A job that raises is not run again now, but by the
-    next call. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next one goes on.
+    A job whose worker dies is run again on another worker, after the others of its group. It fails when three
+    workers have died while running it; other jobs go on. A job that raises is run again by the next call
+    only. `KeyboardInterrupt` and a lost scheduler end the call with `stopped` set; the next call continues.
 
-    **Arguments:** `scheduler` `local`, the address of one that runs, or a cluster object of Dask's; `workers`
-    and `threads_per_worker` for `local` only; `progress(done, jobs, note)` is called as jobs end; `run` in
-    place of `run_task`.
+    **Arguments:**
 
-    **Raises** `ValueError` when a script calls it without a main guard, when another call works on the
-    folder, when it holds something else, when no scheduler answers, and for bad options; and when the extra
-    `cluster` is missing. `OutputError` when the folder's disk is full; what is in it stays, and the next
-    call goes on.
+    - `scheduler`: `local`, the address of a running scheduler, or a Dask cluster object
+    - `workers` and `threads_per_worker`: for `local` only
+    - `progress(done, jobs, note)`: called as jobs end
+    - `run`: replaces `run_task`
+
+    **Raises** `ValueError` for bad options, when the script has no `if __name__ == "__main__"`, when another
+    call works on the folder, when the folder holds something else, when no scheduler answers, and when the
+    extra `cluster` is missing. `OutputError` when the folder's disk is full; its results stay, and the next
+    call continues.
     """
     from sidestep.bridges.campaigns.table import write_table
     from sidestep.trials.campaign import Store, campaign_rows
@@ -129,7 +137,7 @@ def run_campaign(
             outcome.seconds = time.monotonic() - begun
             outcome.damaged = store.damaged()
             outcome.rows = campaign_rows(campaign.jobs, store)
-            # Also what workers put there after the command had lost them.
+            # Includes results that workers wrote after the command had lost them.
             outcome.ran = len(outcome.rows) - outcome.earlier
             try:
                 write_table(store.folder / "results.parquet", outcome.rows)
@@ -142,10 +150,10 @@ def run_campaign(
 
 
 class _Waiting:
-    """Jobs that wait, in groups that differ in nothing but the seed and so run the same compiled programs.
+    """Waiting jobs, in groups that differ only in the seed and so share their compiled programs.
 
-    A worker stays with its group while it lasts, and begins the one at which the fewest are: side by side
-    they compile different programs, where all would compile the first, then the second.
+    A worker takes jobs of one group until the group is empty, then of the group with the fewest workers.
+    Workers thus compile different programs in parallel.
     """
 
     def __init__(self, jobs: Iterable[Job]):
@@ -155,7 +163,7 @@ class _Waiting:
             self.put(job)
 
     def put(self, job: Job) -> None:
-        """Behind the others of its group."""
+        """Append the job to its group."""
         group = repr({name: label for name, label in job.labels.items() if name != "seed"})
         self.groups.setdefault(group, deque()).append(job)
 
@@ -180,17 +188,17 @@ class SchedulerLostError(Exception):
 
 
 class _Dispatch:
-    """Jobs on their way to workers and back, one for each worker at a time, so that one death is one job's.
+    """Submits jobs to workers and collects the results; one job per worker, so a death affects one job.
 
-    A job is for its worker alone. Dask may choose another, but a task that merely prefers a worker, and finds
-    none alive when that one dies, is never given to those that come later.
+    Each job is bound to its worker. Dask never reassigns a task that only prefers a worker if that worker
+    dies while no other is alive.
     """
 
     def __init__(self, client: Any, store: Any, outcome: CampaignOutcome, progress: Show, run: Any):
         from sidestep import __version__
 
         self.client, self.store, self.outcome, self.progress = client, store, outcome, progress
-        # What this call submits is its own: another call's job of the same name is another key.
+        # Keys are unique per call: another call's job of the same name has another key.
         self.call = uuid.uuid4().hex
         self.about = (str(store.folder.absolute()), store.token, __version__, run)
         self.ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -202,7 +210,7 @@ class _Dispatch:
         self.submitted = 0
 
     def all(self, jobs: Iterable[Job]) -> None:
-        """Every job to its end. **Raises** `SchedulerLostError`."""
+        """Run all jobs to their end. **Raises** `SchedulerLostError`."""
         self.waiting = _Waiting(jobs)
         while self.waiting or self.at_work:
             _interrupts.check()
@@ -221,7 +229,7 @@ class _Dispatch:
         self.show(self.known)
 
     def workers(self) -> set[str]:
-        """Addresses of the workers that are there."""
+        """Addresses of the live workers."""
         if self.client.status != "running":
             raise SchedulerLostError
         try:
@@ -243,7 +251,7 @@ class _Dispatch:
         future.add_done_callback(self.ended.put)
 
     def died(self, future: Any, job: Job) -> None:
-        """The worker of a job is gone: another one's turn, unless too many are."""
+        """Queue the job of a dead worker again, or fail it after too many deaths."""
         del self.at_work[future]
         future.cancel()
         self.deaths[job.id] += 1
@@ -253,17 +261,17 @@ class _Dispatch:
             self.outcome.failed.append(Failure(job, f"{_MOST_DEATHS} workers died while they ran it"))
 
     def take(self, future: Any) -> None:
-        """What became of a job that ended."""
+        """Record the outcome of a job that ended."""
         from distributed import KilledWorker
 
         if future not in self.at_work:
-            # Its worker was taken for dead; what it finished all the same is in the folder.
+            # The worker was considered dead but finished the job; its result is in the folder.
             return
         job, _ = self.at_work[future]
         if future.status in ("cancelled", "lost"):
             raise SchedulerLostError
         if future.status == "finished":
-            # Most workers have put it there themselves. One that died with what it alone had would be waited
+            # Most workers wrote the result themselves. Waiting for one that died with an unsaved result
             # for without end: nobody else may run that task.
             if self.store.read(job.id) is None:
                 try:

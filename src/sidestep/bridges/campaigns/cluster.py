@@ -1,4 +1,4 @@
-"""Where do the jobs run? On workers that this machine starts, or those of a scheduler that runs already."""
+"""Connect to Dask workers: of this machine, or of a running scheduler."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sidestep._packages import needed
 LOCAL = "local"
 _CONNECT_SECONDS = 10
 _LOCAL_CONFIG = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-"""Dask's web servers have nothing to tell: nobody asks them here."""
+"""Switches off the web servers of Dask's workers, which are not used here."""
 
 
 def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:
-    """Workers, and threads for each: together as many as there are cores, unless told otherwise.
+    """Number of workers and of threads per worker; by default their product is the number of cores.
 
     **Raises** `ValueError` for a number that is not from 1 to 1024.
     """
@@ -37,7 +37,7 @@ def local_size(workers: int | None, threads: int | None) -> tuple[int, int]:
 
 
 def check_options(scheduler: Any, workers: int | None, threads: int | None) -> None:
-    """**Raises** `ValueError` for options that are wrong or do not go together; asks nobody."""
+    """**Raises** `ValueError` for invalid options or combinations, without connecting."""
     if scheduler == LOCAL:
         local_size(workers, threads)
         return
@@ -50,10 +50,11 @@ def check_options(scheduler: Any, workers: int | None, threads: int | None) -> N
 
 
 def check_main_guard() -> None:
-    """**Raises** `ValueError` in a script that the local workers, which import it, would run once more."""
+    """**Raises** `ValueError` if local workers, which import the main script, would call the campaign
+    again."""
     main = sys.modules.get("__main__")
     file, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
-    # What multiprocessing does not import in a child: a prompt, `python -c`, `python -m package`.
+    # multiprocessing does not import these in a child: a prompt, `python -c`, `python -m package`.
     if file is None or (spec is not None and spec.name.endswith(".__main__")):
         return
     if getattr(multiprocessing.current_process(), "_inheriting", False) or not _is_guarded(file):
@@ -64,7 +65,7 @@ def check_main_guard() -> None:
 
 
 def _is_guarded(file: str) -> bool:
-    """Whether the statement of the main script that is running now stands under a test of `__name__`."""
+    """Whether the running statement of the main script is below a test of `__name__`."""
     frame, line = inspect.currentframe(), None
     while frame is not None:
         if frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") == "__main__":
@@ -74,7 +75,7 @@ def _is_guarded(file: str) -> bool:
         statements = ast.parse(Path(file).read_bytes()).body
     except (OSError, SyntaxError, ValueError):
         return True
-    # Called in a thread, or by what is no Python file: nobody can tell.
+    # Called in a thread, or from something that is not a Python file: unknown.
     here = [one for one in statements if line is not None and one.lineno <= line <= (one.end_lineno or 0)]
     return all(isinstance(one, ast.If) and "__name__" in ast.dump(one.test) for one in here)
 
@@ -88,13 +89,12 @@ def name_of(scheduler: Any) -> str:
 
 @contextmanager
 def connected(scheduler: Any, workers: int | None, threads: int | None) -> Iterator[Any]:
-    """A Dask client: of workers on this machine for `local`, else of the scheduler at that address, or of a
-    cluster that one of Dask's deployers has started.
+    """A Dask client: of new workers on this machine (`local`), of the scheduler at an address, or of a Dask
+    cluster object.
 
-    Local workers and their scheduler listen on 127.0.0.1 only, without a dashboard, and end with the command.
+    Local workers and their scheduler listen on 127.0.0.1 only, without a dashboard, and end with the context.
 
-    The options are those that `check_options` lets through. **Raises** `ValueError` when nothing answers at
-    the address.
+    Options must have passed `check_options`. **Raises** `ValueError` when no scheduler answers.
     """
     distributed: Any = needed("distributed", "cluster", "campaigns need")
     if scheduler == LOCAL:
@@ -107,7 +107,7 @@ def connected(scheduler: Any, workers: int | None, threads: int | None) -> Itera
         client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise ValueError(f"no scheduler answers at {name_of(scheduler)}: {error}") from None
-    # Dask tells of a lost connection in many words; the command says it in one line.
+    # Dask logs a lost connection at length; the command reports it in one line.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         yield client
@@ -116,7 +116,7 @@ def connected(scheduler: Any, workers: int | None, threads: int | None) -> Itera
 
 
 def _check_reachable(address: str) -> None:
-    """What Dask would find out too, after long, and tell at length."""
+    """Fail fast, with a short message, where Dask would retry for long."""
     from distributed.comm.addressing import parse_host_port
     from distributed.security import Security
 
@@ -146,7 +146,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Any]:
             processes=True,
             host="127.0.0.1",
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-            # Jobs hold little of their own: a limit would only pause workers beside a large neighbour.
+            # Jobs need little memory: a limit would only pause workers next to a large process.
             memory_limit=0,
             preload="sidestep.bridges.campaigns.worker",
             silence_logs=logging.CRITICAL,

@@ -11,9 +11,9 @@ from sidestep._packages import needed
 
 
 def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write rows as a Parquet file, whole or not at all; a column for every name that any row has.
+    """Write rows as a Parquet file, whole or not at all, with one column per name.
 
-    What a row lacks is null, a column without any value is of floats, lists and tables are JSON text.
+    Missing values are null, a column without values has type float, lists and dicts become JSON text.
 
     **Raises** `ValueError` when pyarrow (extra `cluster`) is missing.
     """

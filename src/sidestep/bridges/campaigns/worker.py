@@ -1,6 +1,6 @@
-"""What a worker does with a job: take its cores, run it once, keep the result.
+"""Run one job on a worker: choose its cores, run it once, keep the result.
 
-Imports nothing heavy: how many threads JAX may have is decided before JAX is.
+Imports nothing heavy, because JAX's number of threads must be set before JAX is imported.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ if TYPE_CHECKING:
     from sidestep.trials.campaign import Task
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A worker's threads are the cores of one job, not so many jobs."""
+"""A worker's threads are the cores of one job, so jobs run one at a time."""
 
 
 def dask_setup(worker: Any) -> None:
-    """Called in a new local worker, before it unpacks anything that imports JAX. Ctrl-C reaches every process
-    of a terminal, but is the command's."""
+    """Called in a new local worker before it imports JAX. The worker ignores Ctrl-C, which the command
+    handles."""
     take_cores(worker.state.nthreads, worker.name)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def take_cores(threads: int, number: Any = None) -> None:
-    """Have JAX, which must not be imported yet, compute in this many threads and keep compiled programs.
+    """Set the number of JAX's threads and its compilation cache. JAX must not be imported yet.
 
-    `number` of a local worker, a whole number: it then keeps to cores of its own, where there are enough.
+    `number`, the index of a local worker, pins the worker to separate cores if there are enough.
     """
     if "jax" in sys.modules:
         return
     keep_compiled_programs()
     _keep_to_cores(threads, number)
     os.environ.update(thread_limits(threads))
-    # Several workers share an accelerator: none takes all its memory.
+    # Workers share the accelerator: none may allocate all its memory.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
 def _keep_to_cores(threads: int, number: Any) -> None:
-    """XLA's threads wait for work by looking for it again and again: on a core of another worker they take
-    that one's time. Threads that this one starts stay with it."""
+    """Pin the process to its cores. XLA's threads wait in a busy loop, which would slow another worker down
+    if they shared its core. Threads started later inherit the cores."""
     if not isinstance(number, int) or not hasattr(os, "sched_setaffinity"):
         return
     cores = sorted(os.sched_getaffinity(0))[number * threads : (number + 1) * threads]
@@ -59,9 +59,9 @@ def _keep_to_cores(threads: int, number: Any) -> None:
 def run_on_worker(
     task: Any, folder: str, token: str, version: str, run: Callable[[Task, Path | None], Any] | None
 ) -> dict[str, Any]:
-    """`run_once` on the cores of the Dask worker that this is called on.
+    """`run_once` on the cores of the current Dask worker.
 
-    **Raises** what the job raises; `RuntimeError` where another version of sidestep is installed than there.
+    **Raises** what the job raises, and `RuntimeError` if the worker has another version of sidestep.
     """
     from distributed import get_worker
 
@@ -80,10 +80,10 @@ def run_on_worker(
 def run_once(
     task: Any, folder: str, token: str, run: Callable[[Task, Path | None], Any] | None
 ) -> dict[str, Any]:
-    """The record of a job, from the campaign's folder if it is there already.
+    """The record of a job; read from the campaign's folder if it has been run already.
 
-    Where this process sees the folder it puts the result there itself, so that nothing is lost with the
-    scheduler, and waits while another one runs the same job; elsewhere the command alone keeps it.
+    A process with access to the folder writes the result itself, so that it survives the scheduler, and waits
+    while another process runs the same job. Without access, only the command writes it.
     """
     from sidestep.trials.campaign import Store, run_task
     from sidestep.trials.campaign.jobs import record_of

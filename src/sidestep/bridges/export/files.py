@@ -1,4 +1,4 @@
-"""What an export writes."""
+"""Files and metadata of an export."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ UNITS = "positions m, velocities m/s, headings rad counter-clockwise; world axes
 WHAT = ("policy+filter", "policy", "filter")
 """What can be exported."""
 ALONE = "export the policy alone (what='policy', --what policy)"
-"""What to do where a filter cannot be exported."""
+"""Advice where a filter cannot be exported."""
 STATUS_WORDS = "0 ok, 1 corrected, 2 infeasible, 3 invalid"
 
 
 def check_what(scenario: Scenario, what: str, policy: object | None) -> None:
-    """**Raises** `ValueError` for an unknown `what`, a missing policy, a scenario that no filter serves."""
+    """**Raises** `ValueError` for an unknown `what`, a missing policy, or a scenario without a filter."""
     if what not in WHAT:
         raise ValueError(f"cannot export {what!r}; use one of {', '.join(map(repr, WHAT))}")
     if policy is None and what != "filter":
@@ -31,8 +31,7 @@ def check_what(scenario: Scenario, what: str, policy: object | None) -> None:
 
 
 def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:
-    """Write a file whole or not at all. **Raises** `ValueError` where there is one and `overwrite` is not
-    set."""
+    """Write a file whole or not at all. **Raises** `ValueError` if it exists and `overwrite` is not set."""
     path = Path(path)
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists already; give another file, or --overwrite to replace it")
@@ -41,7 +40,7 @@ def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:
 
 
 def facts(scenario: Scenario, what: str, shield: str | None, **more: Any) -> dict[str, Any]:
-    """What an exported file says about itself, as plain JSON values."""
+    """Metadata of an exported file, as plain JSON values."""
     about = {
         "sidestep": sidestep.__version__,
         "what": what,
@@ -55,7 +54,7 @@ def facts(scenario: Scenario, what: str, shield: str | None, **more: Any) -> dic
 
 
 def as_text(about: Mapping[str, Any]) -> dict[str, str]:
-    """The same as text by name, for a file format that holds only that: JSON where it is not text already."""
+    """Metadata as text by name; values that are not text become JSON."""
     return {
         name: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
         for name, value in sorted(about.items())

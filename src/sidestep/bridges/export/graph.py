@@ -1,8 +1,8 @@
-"""How is an ONNX graph written as formulas?
+"""Write ONNX graphs as formulas.
 
-A `Tensor` stands for a value that will exist when the graph runs; arithmetic on it adds nodes to its `Graph`.
-onnxruntime takes some 0.3 microseconds per node, however small, and three times that for a `Where`: formulas
-are written with few nodes, on several numbers at once, and choose by `min`, `max` and signs where they can.
+A `Tensor` is a symbolic value; arithmetic on it adds nodes to its `Graph`. onnxruntime takes about 0.3 us per
+node, however small, and three times as long for a `Where`. Formulas therefore use few nodes on wide tensors,
+and `min`, `max` and signs in place of `Where`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from sidestep._packages import needed
 
 OPSET = 17
-"""Known to onnxruntime from 1.12 on."""
+"""Supported since onnxruntime 1.12."""
 _IR_VERSION = 8
 
 Number: TypeAlias = "Tensor | float | np.ndarray | Sequence[Any]"
@@ -70,22 +70,21 @@ class Tensor:
         return self.graph.op(operator, self)
 
     def over(self, reduction: str, axis: int = -1) -> Tensor:
-        """A reduction by its ONNX name (`ReduceMax`, `ReduceL2`, ...) along one axis, which stays with size
-        1."""
+        """A reduction by its ONNX name (`ReduceMax`, `ReduceL2`, ...) along one axis, kept with size 1."""
         if reduction == "ReduceSum":
             return self.graph.op(reduction, self, np.array([axis]), keepdims=1)
         return self.graph.op(reduction, self, axes=[axis], keepdims=1)
 
     def reshape(self, *shape: int) -> Tensor:
-        """Another shape; 0 keeps a size, -1 is what is left."""
+        """Another shape; 0 keeps a size, -1 is inferred."""
         return self.graph.op("Reshape", self, np.array(shape))
 
     def transpose(self, *order: int) -> Tensor:
-        """Axes in another order."""
+        """Permute the axes."""
         return self.graph.op("Transpose", self, perm=list(order))
 
     def take(self, indices: Sequence[int], axis: int = -1) -> Tensor:
-        """Entries by number along an axis."""
+        """Entries by index along an axis."""
         return self.graph.op("Gather", self, np.array(indices), axis=axis)
 
     def part(self, start: int, stop: int, axis: int = -1) -> Tensor:
@@ -94,7 +93,7 @@ class Tensor:
 
 
 class Graph:
-    """An ONNX graph under construction; equal constants are stored once, and names follow from the order."""
+    """An ONNX graph under construction. Equal constants are stored once; names follow creation order."""
 
     def __init__(self) -> None:
         self._onnx = needed("onnx", "export", "exporting needs")
@@ -120,12 +119,12 @@ class Graph:
         return Tensor(self, name)
 
     def output(self, name: str, value: Tensor, *shape: int | str, kind: str = "FLOAT") -> None:
-        """Give `value`, the result of a node, out under this name."""
+        """Make `value`, the result of a node, an output of this name."""
         self._renamed[value.name] = name
         self._outputs.append(self._described(name, shape, kind))
 
     def constant(self, value: Any) -> Tensor:
-        """A number or array: float32, or int64 where it is whole numbers."""
+        """A constant: float32, or int64 for integer arrays."""
         array = np.asarray(value)
         array = np.ascontiguousarray(array, np.int64 if array.dtype.kind in "iu" else np.float32).reshape(
             array.shape
@@ -135,12 +134,12 @@ class Graph:
         return Tensor(self, name)
 
     def _names(self, inputs: Sequence[Number | None]) -> list[str]:
-        """Names of tensors and constants; None is an optional input that is left out."""
+        """Names of tensors and constants; None is an omitted optional input."""
         values = [self.constant(_plain(x)) if not isinstance(x, Tensor | None) else x for x in inputs]
         return ["" if value is None else value.name for value in values]
 
     def op(self, operator: str, *inputs: Number | None, **attributes: Any) -> Tensor:
-        """A node of this ONNX operator, with one output; the same node asked for again is not made twice."""
+        """A node of this ONNX operator, with one output; an equal node is reused."""
         names = self._names(inputs)
         key = (operator, tuple(names), repr(attributes))
         if key not in self._known:
@@ -157,14 +156,14 @@ class Graph:
         return [Tensor(self, name) for name in outputs]
 
     def split(self, value: Tensor, *sizes: int) -> list[Tensor]:
-        """`value` cut along its last axis."""
+        """Split `value` along its last axis."""
         return self.several("Split", len(sizes), value, np.array(sizes), axis=-1)
 
     def linear(
         self, value: Tensor, weights: np.ndarray, bias: Any = None, *, added: Tensor | None = None
     ) -> Tensor:
-        """value @ weights + bias for `value (batch, n)`: the cheapest way to pick, repeat, scale and add up
-        columns. `added (batch, ...)` is a bias that is not constant; `bias` may be one number for all."""
+        """value @ weights + bias for `value (batch, n)`: the cheapest way to select, repeat, scale and add
+        columns. `added (batch, ...)` is a bias that is not constant; `bias` may be a scalar."""
         if added is not None:
             return self.op("Gemm", value, weights, added)
         if bias is None:
@@ -172,7 +171,7 @@ class Graph:
         return self.op("Gemm", value, weights, np.broadcast_to(np.asarray(bias, float), weights.shape[1:]))
 
     def join(self, *parts: Number, axis: int = -1) -> Tensor:
-        """Parts one after the other along an axis."""
+        """Concatenate along an axis."""
         return (
             parts[0]
             if len(parts) == 1 and isinstance(parts[0], Tensor)
@@ -180,23 +179,23 @@ class Graph:
         )
 
     def largest(self, *values: Number) -> Tensor:
-        """The larger of all, entry by entry."""
+        """Elementwise maximum."""
         if len(values) == 2 and isinstance(values[1], float):
             return self.op("Clip", *values)
         return self.op("Max", *values)
 
     def least(self, *values: Number) -> Tensor:
-        """The smaller of all, entry by entry."""
+        """Elementwise minimum."""
         if len(values) == 2 and isinstance(values[1], float):
             return self.op("Clip", values[0], None, values[1])
         return self.op("Min", *values)
 
     def where(self, condition: Tensor, value: Number, otherwise: Number) -> Tensor:
-        """`value` where the condition holds; not a number in the other one does no harm."""
+        """`value` where the condition holds, else `otherwise`; NaN in the branch not taken has no effect."""
         return self.op("Where", condition, value, otherwise)
 
     def model(self, name: str, text: str, metadata: dict[str, str]) -> bytes:
-        """The checked model as bytes; the same graph gives the same bytes.
+        """The checked model as bytes; equal graphs give equal bytes.
 
         **Raises** `onnx.checker.ValidationError` for a graph that is no valid ONNX.
         """
@@ -217,5 +216,5 @@ class Graph:
 
 
 def _plain(value: Any) -> Any:
-    """Whole Python numbers mean float32 in formulas; integer arrays are indices and shapes."""
+    """Python integers are float32 in formulas; integer arrays are indices and shapes."""
     return value if isinstance(value, np.ndarray) else np.asarray(value, np.float32)

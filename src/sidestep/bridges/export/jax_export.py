@@ -1,4 +1,4 @@
-"""A policy and any shield as JAX programs that need nothing of this package to run."""
+"""Export a policy and any shield as JAX programs that run without this package."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sidestep.safety import Shield
 from sidestep.world import Scenario, World, observation_size
 
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""Where an exported program runs."""
+"""Platforms an exported program runs on."""
 _NO_DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -36,18 +36,18 @@ def export_jax(
     run: str = "",
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Write a zip of `jax.export` programs and `about.json`, and return what that says.
+    """Write a zip of `jax.export` programs and `about.json`; returns the content of `about.json`.
 
     - `policy`: `action = policy(observation)`
     - `start`: `memory = start(evader, pursuers, obstacles, target, wheel_speeds)`, a tuple of arrays
     - `step`: `velocity, status, barriers, slack, *memory = step(evader, pursuers, obstacles, target,
-      wheel_speeds, *memory)`; for a `filter` the wished velocity (m/s) comes before the memory
+      wheel_speeds, *memory)`; for a `filter` the nominal velocity (m/s) comes before the memory
 
-    Shapes as in `World`, with a symbolic batch in front; `joint` takes one world at a time, without. Each is
-    read with `jax.export.deserialize` and run with `.call`; that needs jax and flatbuffers.
+    Shapes as in `World`, with a symbolic batch axis in front; `joint` takes one world, without batch axis.
+    Read a program with `jax.export.deserialize` and run it with `.call`; that needs jax and flatbuffers.
 
-    **Raises** `ValueError` for an unknown `what`, a missing policy, a file that exists, or where flatbuffers
-    is not installed.
+    **Raises** `ValueError` for an unknown `what`, a missing policy, a file that exists, or missing
+    flatbuffers.
     """
     needed("flatbuffers", "export", "exporting needs")
     check_what(scenario, what, policy)
@@ -96,15 +96,15 @@ def _shield_programs(
         result, after = shield(world, nominal, jax.tree.unflatten(structure, rest))
         return (result.action, result.status, result.barriers, result.slack, *jax.tree.leaves(after))
 
-    wish = [place] if policy is None else []
+    action = [place] if policy is None else []
     return {
         "start": _program(start, state, batched),
-        "step": _program(step, [*state, *wish, *memory], batched),
+        "step": _program(step, [*state, *action, *memory], batched),
     }
 
 
 def _program(function: Any, examples: list[Any], batched: bool) -> bytes:
-    """`function`, for arguments of these shapes and types, as bytes."""
+    """`function` exported for arguments of these shapes and dtypes, as bytes."""
     if batched:
         function = jax.vmap(function)
         (batch,) = export.symbolic_shape("batch")
@@ -115,7 +115,7 @@ def _program(function: Any, examples: list[Any], batched: bool) -> bytes:
 
 
 def _archive(programs: dict[str, bytes], about: dict[str, Any]) -> bytes:
-    """A zip whose bytes depend on nothing but what is in it."""
+    """A zip file whose bytes depend only on its content."""
     buffer = io.BytesIO()
     entries = {**programs, "about.json": json.dumps(about, indent=2, sort_keys=True).encode()}
     with zipfile.ZipFile(buffer, "w") as file:

@@ -1,4 +1,4 @@
-"""By how much rows must give way, as a graph: the levels in the disc of `safety.filter.least_violation`."""
+"""Relaxation of infeasible rows as a graph: the levels in the disc of `safety.filter.least_violation`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Row: TypeAlias = tuple[Tensor, Tensor]
 
 
 def relaxed(graph: Graph, rows: list[Row], hard: int) -> list[Tensor]:
-    """Offsets that can all hold: the first `hard` rows give way as little as can be, the others after
-    them."""
+    """Offsets of a feasible set of rows: the first `hard` rows are relaxed as little as possible, then the
+    others."""
     kept = _give_way(graph, rows[:hard], 0)
     if hard < len(rows):
         both = [(normal, offset) for (normal, _), offset in zip(rows, kept, strict=False)] + rows[hard:]
@@ -32,7 +32,7 @@ def _give_way(graph: Graph, rows: list[Row], first: int) -> list[Tensor]:
     if first == 0 and len(rows) == 1:
         return [graph.least(rows[0][1], 1.0)]
     if (first, len(rows)) == (1, 2):
-        # The most that one row can ask beside one that is kept.
+        # The largest offset that one row can have beside one that is kept.
         return [graph.least(rows[1][1], _best_beside(graph, rows[0], rows[1]))]
     level = graph.join(*_levels(graph, rows, first), axis=1).over("ReduceMax", axis=1).apply("Relu")
     return [offset - level for _, offset in rows[first:]]
@@ -71,8 +71,8 @@ def _root(value: Tensor) -> Tensor:
 
 
 def _best_beside(graph: Graph, kept: Row, free: Row) -> Tensor:
-    """The most that n_free.u can be in the disc where the other row holds: 1 where that lets n_free itself
-    pass, else at the end of its line."""
+    """The maximum of n_free.u over the disc where the other row holds: 1 if the row allows u = n_free, else
+    the value where the row's line meets the circle."""
     along = (kept[0] * free[0]).over("ReduceSum")
     least = graph.largest(kept[1], along)
     return least * along + _cross(kept[0], free[0]).apply("Abs") * _root(1.0 - least * least)

@@ -11,7 +11,7 @@ from sidestep.bridges.export.files import as_text, check_what, facts, write_new
 from sidestep.bridges.export.filter_graph import CORRECTED, TOLERANCE, Verdict, closest
 from sidestep.bridges.export.graph import OPSET, Graph, Tensor
 from sidestep.bridges.export.pair_graph import closest_of_pair
-from sidestep.bridges.export.policy_graph import network, wished
+from sidestep.bridges.export.policy_graph import network, nominal_action
 from sidestep.bridges.export.rows_graph import constants_of, rows_towards_all
 from sidestep.bridges.export.scene import NO_NUMBER, Scene, read_scene
 from sidestep.learning import LearnedPolicy
@@ -38,7 +38,7 @@ def export_onnx(
     run: str = "",
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Write an ONNX model (opset 17, symbolic batch, float32) and return what it says about itself.
+    """Write an ONNX model (opset 17, symbolic batch, float32); returns its metadata.
 
     - `policy`: `observation (batch, n)` -> `action (batch, 2)`
     - `filter`: `evader (batch, 2)`, `pursuers (batch, m, 3)`, `obstacles (batch, k, 4)` unless k = 0,
@@ -46,15 +46,15 @@ def export_onnx(
       `next_sides (batch, m)`
     - `policy+filter`: the same with `target (batch, 2)` in place of `wish`
 
-    The filter is that of the shield `game`: what `joint` adds, looking ahead, does not fit a small graph. It
-    answers as `GameShield(scenario)` does, non-finite input included; coordinates beyond 1e15 m count as not
-    finite. It does not go round an obstacle that the robot is stuck behind (`goes_round`).
+    `wish` is the nominal velocity. The filter is that of the shield `game`; the look-ahead of `joint` does
+    not fit a small graph. It answers as `GameShield(scenario)` does, for non-finite input too; coordinates
+    beyond 1e15 m count as not finite. It does not go round an obstacle that blocks the robot (`goes_round`).
 
-    **Arguments:** `policy` is not needed for a `filter`; `shield` a `game` shield with its budget, the plain
-    one by default; `run` where the policy came from, for the record.
+    **Arguments:** `policy`, not needed for a `filter`; `shield`, a `game` shield, by default without a
+    budget; `run`, the origin of the policy, stored in the metadata.
 
-    **Raises** `ValueError` for an unknown `what`, a policy of another scenario, a shield or scenario that a
-    graph cannot hold, a file that exists, or where onnx is not installed.
+    **Raises** `ValueError` for an unknown `what`, a policy of another scenario, a shield or scenario that the
+    graph does not support, a file that exists, or missing onnx.
     """
     check_what(scenario, what, policy)
     if policy is not None:
@@ -98,24 +98,24 @@ def _filtered(graph: Graph, shield: GameShield, policy: LearnedPolicy | None) ->
     scenario, constants = shield.scenario, constants_of(shield)
     m, speed = scenario.pursuer_count, float(scenario.evader_speed)
     scene = read_scene(graph, scenario, target=policy is not None)
-    wish, outside, valid = None, [], scene.valid
+    nominal, outside, valid = None, [], scene.valid
     if policy is not None:
-        start = wished(graph, scenario, policy, scene)
+        start = nominal_action(graph, scenario, policy, scene)
     else:
-        start, wish, excess, valid = _given_wish(graph, speed, scene)
+        start, nominal, excess, valid = _nominal_input(graph, speed, scene)
         outside = [excess]
     rows, sides = rows_towards_all(graph, constants, scene, graph.input("sides", "batch", m))
     if (m, len(rows)) == (1, 2):
-        velocity, verdict = closest_of_pair(graph, start, rows[0], rows[1], speed, wish)
+        velocity, verdict = closest_of_pair(graph, start, rows[0], rows[1], speed, nominal)
     else:
-        velocity, verdict = closest(graph, start, rows, m, speed, wish)
+        velocity, verdict = closest(graph, start, rows, m, speed, nominal)
     graph.output("velocity", velocity, "batch", 2)
     graph.output("status", _status(graph, verdict, outside, valid), "batch", kind="INT32")
     graph.output("next_sides", sides, "batch", m)
 
 
 def _status(graph: Graph, verdict: Verdict, outside: list[Tensor], valid: Tensor) -> Tensor:
-    """The largest grade that applies: the filter's, corrected for a wish beyond the speed limit, invalid."""
+    """The largest grade that applies: of the filter, of a nominal action beyond the speed limit, invalid."""
     given, flags = verdict.weights.shape
     more = len(outside) + 1
     weights = np.zeros((given + more, flags + more))
@@ -129,16 +129,16 @@ def _status(graph: Graph, verdict: Verdict, outside: list[Tensor], valid: Tensor
     return graph.op("Cast", worst, to=6)
 
 
-def _given_wish(graph: Graph, speed: float, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The input `wish` (m/s): its projection on the unit disc, itself in units of the speed limit, by how
-    much it lies outside, and whether everything that came in was finite; the last two `(batch, 1)`."""
+def _nominal_input(graph: Graph, speed: float, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The input `wish` (m/s), the nominal action: its projection on the unit disc, itself in units of the
+    speed limit, its excess over the limit, and whether all inputs are finite; the last two `(batch, 1)`."""
     given = graph.input("wish", "batch", 2)
     known = given.over("ReduceL1") < NO_NUMBER
     valid = graph.op("Cast", known, to=1) * scene.valid
-    wish = graph.where(known, given, 0.0) * (scene.valid * (1.0 / speed))
-    length = wish.over("ReduceL2")
+    nominal = graph.where(known, given, 0.0) * (scene.valid * (1.0 / speed))
+    length = nominal.over("ReduceL2")
     farthest = 1.0 / float(np.finfo(np.float32).eps)
-    start = wish / graph.largest(length, 1.0)
-    # Far out only its direction matters.
+    start = nominal / graph.largest(length, 1.0)
+    # Far outside the disc only the direction matters.
     near = start * graph.largest(graph.least(length, farthest), 1.0)
     return start, near, length - 1.0, valid

@@ -1,8 +1,8 @@
-"""The exact filter for one hard row and one soft one, in fewer nodes than the general one takes.
+"""The exact filter for one hard row and one soft row, in fewer nodes than the general filter.
 
-Once both rows can hold (see `levels_graph`), the nearest velocity in the disc that keeps the soft row is the
-answer if it keeps the hard row too; else the answer lies on the hard row's line. A velocity is told by a
-row's axes: d along n = -N, and t along T, a quarter turn from it.
+Once the rows are feasible (see `levels_graph`), the answer is the nearest velocity in the disc that keeps the
+soft row if it keeps the hard row too; else it lies on the hard row's line. Velocities are given in a row's
+axes: d along n = -N, and t along T, perpendicular to it.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _STEEP = 1e12
 
 
 def closest_of_pair(
-    graph: Graph, start: Tensor, hard: Row, soft: Row, speed: float, wish: Tensor | None = None
+    graph: Graph, start: Tensor, hard: Row, soft: Row, speed: float, nominal: Tensor | None = None
 ) -> tuple[Tensor, Verdict]:
-    """As `closest`, for these two rows."""
-    vectors = graph.join(hard[0], soft[0], start, *([] if wish is None else [wish]))
-    size = 6 if wish is None else 8
+    """As `filter_graph.closest`, for these two rows."""
+    vectors = graph.join(hard[0], soft[0], start, *([] if nominal is None else [nominal]))
+    size = 6 if nominal is None else 8
     products = _products(graph, vectors, size)
     dot, cross, _, d_soft, t_hard, t_soft = graph.split(products, *[1] * 6)
 
     kept = graph.least(hard[1], 1.0)
-    # The most that the soft row can ask beside the hard one.
+    # The largest offset that the soft row can have beside the hard one.
     reach = graph.largest(kept, dot)
     most = reach * dot + cross.apply("Abs") * _other_leg(graph, reach)
     eased = graph.least(soft[1], most)
@@ -42,7 +42,7 @@ def closest_of_pair(
     steep = graph.largest(cross * cross, ROUNDING**2)
     on_line = _within(graph, t_hard - over * cross / steep, _other_leg(graph, kept))
 
-    # 1 where the answer is on the hard row's line, else 0: steep between.
+    # 1 where the answer is on the hard row's line, else 0, with a steep transition.
     on_hard = graph.op("Clip", graph.linear(short, _STEEP * np.eye(1), -_STEEP * TOLERANCE), 0.0, 1.0)
     parts = graph.join(along, aside, kept, on_line) * graph.linear(
         on_hard, np.array([[-1.0, -1.0, 1.0, 1.0]]), [1.0, 1.0, 0.0, 0.0]
@@ -58,14 +58,14 @@ def closest_of_pair(
 
 
 def _verdict(parts: list[Tensor]) -> Verdict:
-    """Corrected where the wish misses a row, infeasible where one had to give way."""
+    """Corrected where the nominal action violates a row, infeasible where a row was relaxed."""
     weights = picks(10, {0: 1.0, 4 + 2: -1.0}, {1: 1.0, 4 + 3: -1.0}, {0: 1.0, 2: -1.0}, {1: 1.0, 3: -1.0})
     return Verdict(parts, weights, (CORRECTED, CORRECTED, INFEASIBLE, INFEASIBLE))
 
 
 def _products(graph: Graph, vectors: Tensor, size: int) -> Tensor:
-    """n_hard.n_soft, n_hard.T_soft, and d and t of the wish along the axes of both rows, `(batch, 6)`; where
-    wish and projection differ t is the wish's, and d the projection's."""
+    """n_hard.n_soft, n_hard.T_soft, and d and t of the nominal action along the axes of both rows, `(batch,
+    6)`; d is that of its projection on the disc if they differ."""
     x, y = size - 2, size - 1
     pairs = [
         (0, 2, {0: 1.0}), (1, 3, {0: 1.0}), (1, 2, {1: 1.0}), (0, 3, {1: -1.0}),

@@ -1,8 +1,8 @@
-"""The policy's part of a graph: what it observes, and its network.
+"""The policy's part of a graph: its observation and its network.
 
-The observation is that of `sidestep.world.observe`, in other terms that take few nodes: the weights of the
-first layer put them together. A vector v in the policy's axes, for one, is told as v_x x, v_y y, v_y x and
-v_x y, with (x, y) the direction of the target.
+The observation is that of `sidestep.world.observe`. The graph computes simpler terms in few nodes, and the
+weights of the first layer combine them. A vector v in the policy's axes, for example, is given by v_x x,
+v_y y, v_y x and v_x y, where (x, y) is the direction of the target.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from sidestep.learning import LearnedPolicy
 from sidestep.world import Scenario, observation_names
 from sidestep.world.observation import FAR_TARGET, NEAR_ROBOT, NEAR_TARGET
 
-Told: TypeAlias = list[tuple[str, float]]
-"""Of each entry, which observation it is a part of, and by what it is to be multiplied."""
+Terms: TypeAlias = list[tuple[str, float]]
+"""Of each entry: the observation it is a term of, and its factor."""
 
 
 def network(
     graph: Graph,
     policy: LearnedPolicy,
     entries: Tensor,
-    told: Told | None = None,
+    terms: Terms | None = None,
     names: list[str] | None = None,
 ) -> Tensor:
     """The policy's action in [-1, 1]^2, `(batch, 2)`, for `entries (batch, n)`.
 
-    By default they are the observation itself; else `told` says what they are, `names` being the names of the
-    observation.
+    By default the entries are the observation. Otherwise `terms` describes them, and `names` are the names of
+    the observation.
     """
     body = policy.actor.body
     layers = [(np.asarray(w), np.asarray(b)) for w, b in zip(body.weights, body.biases, strict=True)]
     layer = entries
     for index, (weight, bias) in enumerate(layers):
-        if index == 0 and told is not None and names is not None:
-            weight = np.stack([scale * weight[names.index(name)] for name, scale in told])
+        if index == 0 and terms is not None and names is not None:
+            weight = np.stack([scale * weight[names.index(name)] for name, scale in terms])
         layer = graph.op("Gemm", layer, weight, bias)
         layer = layer.apply("Tanh" if index == len(layers) - 1 else "Relu")
     return layer
 
 
-def wished(graph: Graph, scenario: Scenario, policy: LearnedPolicy, scene: Scene) -> Tensor:
-    """The velocity that the policy asks for in a scene, `(batch, 2)` in world axes and units of the evader's
-    speed, of length at most 1; zero where something that came in is not finite."""
+def nominal_action(graph: Graph, scenario: Scenario, policy: LearnedPolicy, scene: Scene) -> Tensor:
+    """The policy's nominal action, `(batch, 2)` in world axes and units of the evader's speed, of length at
+    most 1; zero where an input is not finite."""
     action = network(
         graph, policy, *_observed(graph, scenario, _nearest_first(scene)), observation_names(scenario)
     )
@@ -60,13 +60,13 @@ def wished(graph: Graph, scenario: Scenario, policy: LearnedPolicy, scene: Scene
 
 
 def _target_picks(scene: Scene, order: tuple[int, ...]) -> np.ndarray:
-    """Components of the target's direction, out of `Scene.shortened`."""
+    """Weights that select the target's direction from `Scene.shortened`."""
     n, k = scene.count, scene.obstacles
     return picks(2 * (n + 1 + k), *({2 * n + axis: 1.0} for axis in order))
 
 
 def _nearest_first(scene: Scene) -> Scene:
-    """The same scene with pursuers and obstacles sorted, as the observation has them."""
+    """The scene with pursuers and obstacles sorted by distance, as in the observation."""
     graph, m, k = scene.graph, scene.pursuers, scene.obstacles
     if max(m, k) <= 1:
         return scene
@@ -84,8 +84,8 @@ def _nearest_first(scene: Scene) -> Scene:
     return Scene(graph, rows, m, k, scene.has_target, scene.valid)
 
 
-def _observed(graph: Graph, scenario: Scenario, scene: Scene) -> tuple[Tensor, Told]:
-    """Entries for the network, and what they are."""
+def _observed(graph: Graph, scenario: Scenario, scene: Scene) -> tuple[Tensor, Terms]:
+    """Entries for the network, and their terms."""
     m, k, n = scene.pursuers, scene.obstacles, scene.count
     robots = [f"pursuer{i}" for i in range(m)] + [f"obstacle{i}" for i in range(k)]
     contact = np.array(
@@ -96,7 +96,7 @@ def _observed(graph: Graph, scenario: Scenario, scene: Scene) -> tuple[Tensor, T
         "Exp"
     )
     far = graph.linear(scene.distances, picks(n + 1, {n: 1.0 / FAR_TARGET})).apply("Tanh")
-    told = [(f"{robot}_near", 1.0) for robot in robots] + [("target_near", 1.0), ("target_far", 1.0)]
+    terms = [(f"{robot}_near", 1.0) for robot in robots] + [("target_near", 1.0), ("target_far", 1.0)]
 
     # Vectors, out of p/(1 + |p|), headings and drifts.
     shortened = scene.shortened()
@@ -113,14 +113,14 @@ def _observed(graph: Graph, scenario: Scenario, scene: Scene) -> tuple[Tensor, T
     total = width + 2 * m + (4 * (n + 1) if k else 0)
     if scenario.frame == "world":
         columns = [index for x, y, *_ in vectors for index in (x, y)]
-        told += [(name, scale) for _, _, *names, scale in vectors for name in names]
-        # Zero where the evader is upon it, which the direction is not.
+        terms += [(name, scale) for _, _, *names, scale in vectors for name in names]
+        # Zero where the evader is at the target; the direction is not.
         row = graph.linear(scene.flat, picks(4 * (n + 1), {4 * n: 1.0}, {4 * n + 1: 1.0}))
         length = graph.linear(scene.distances, picks(n + 1, {n: 1.0}, {n: 1.0}), 1e-20)
-        told += [("target_cos", 1.0), ("target_sin", 1.0)]
-        return graph.join(near, far, sources.take(columns), row / length), told
+        terms += [("target_cos", 1.0), ("target_sin", 1.0)]
+        return graph.join(near, far, sources.take(columns), row / length), terms
     one = graph.linear(sources, picks(total, *({i: 1.0} for x, y, *_ in vectors for i in (x, y, y, x))))
     other = graph.linear(shortened, _target_picks(scene, (0, 1, 0, 1) * len(vectors)))
     for _, _, ahead, aside, scale in vectors:
-        told += [(ahead, scale), (ahead, scale), (aside, scale), (aside, -scale)]
-    return graph.join(near, far, one * other), told
+        terms += [(ahead, scale), (ahead, scale), (aside, scale), (aside, -scale)]
+    return graph.join(near, far, one * other), terms

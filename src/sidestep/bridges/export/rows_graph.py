@@ -1,6 +1,7 @@
-"""The rows of the shield `game` as a graph; the barriers themselves are in `safety.barriers.barrier`.
+"""The rows of the shield `game` as a graph; its barriers are in `safety.barriers`.
 
-A row n.u >= c is kept as N = -n, which points towards the other robot, and c in units of the evader's speed.
+A row n.u >= c is stored as N = -n, which points towards the other robot, and c in units of the evader's
+speed.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ _SMALLEST = 1e-30
 
 @dataclass(frozen=True)
 class Constants:
-    """The numbers in the rows: distances and sizes in m, slopes in 1/s, speeds in units of the evader's.
+    """The constants of the rows: distances in m, gains in 1/s, speeds in units of the evader's.
 
-    `unlost` is how much of the distance kept an evader may have used up without counting as lost.
+    `unlost` is the sampling margin (m): within it, the evader's side does not count as lost.
     """
 
     speed: float
@@ -48,11 +49,11 @@ class Constants:
 
 
 def constants_of(shield: GameShield) -> tuple[Constants, Constants]:
-    """Those of a `game` shield: of its rows, at the distances that it keeps, and of the choice of sides,
-    for which the budget also leaves a doubt on which side the evader is.
+    """The constants of a `game` shield's rows, and those of its choice of sides, where the budget also makes
+    the evader's side uncertain.
 
-    **Raises** `ValueError` for what a graph cannot hold: a scenario of fixed speed, a pursuer gain of 0, a
-    shield that is told the pursuers' velocities or lets the wish pick the side.
+    **Raises** `ValueError` for what the graph does not support: a scenario of fixed speed, a pursuer gain of
+    0, a shield that gets the pursuers' velocities or lets the nominal action choose the side.
     """
     scenario, budget = shield.scenario, shield.budget
     if scenario.action != "velocity":
@@ -102,8 +103,8 @@ def rows_towards_all(
 ) -> tuple[list[Row], Tensor]:
     """The rows towards each pursuer, then each obstacle; and the next sides, `(batch, m)`.
 
-    `constants` as `constants_of` gives them; `sides` are those of the call before: +1 left of a pursuer's
-    axis, -1 right, 0 none yet.
+    `constants` as from `constants_of`; `sides` of the previous call: +1 left of a pursuer's axis, -1 right,
+    0 none yet.
     """
     normals, offsets, chosen = _towards_pursuers(graph, constants, scene, sides)
     rows = _one_by_one(normals, offsets, scene.pursuers)
@@ -133,13 +134,13 @@ def _towards_obstacles(graph: Graph, constants: Constants, scene: Scene) -> tupl
 def _towards_pursuers(
     graph: Graph, constants: tuple[Constants, Constants], scene: Scene, sides: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """N `(batch, 2 m)`, c `(batch, m)` and the sides that are followed."""
+    """N `(batch, 2 m)`, c `(batch, m)` and the chosen sides."""
     m, (rows, choice) = scene.pursuers, constants
-    # Vectors are turned by [x c, y s, y c, x s] of (x, y) and a heading (c, s).
+    # Rotations use the products [x c, y s, y c, x s] of a vector (x, y) and a heading (c, s).
     turn = graph.linear(scene.headings, picks(2 * m, *({j: 1.0} for i in range(m) for j in (i, m + i) * 2)))
     places = picks(4 * scene.robots, *({4 * i + j: 1.0} for i in range(m) for j in (0, 1, 1, 0)))
-    # The offset points from the evader to the pursuer; z the other way, in the pursuer's frame. Where z is 0
-    # it is taken to be ahead and left.
+    # Scene rows point from the evader to the pursuer; z is the opposite, in the pursuer's frame. Where z is
+    # 0 it counts as ahead and left.
     z = graph.linear(
         graph.linear(scene.flat, places) * turn,
         for_each(m, [[-1.0, 0.0], [-1.0, 0.0], [0.0, -1.0], [0.0, 1.0]]),
@@ -155,7 +156,7 @@ def _towards_pursuers(
         doubt = _doubt(graph, choice, scene, away)
         _, _, *margins = _both_sides(graph, choice, _bends(graph, choice, shares, m), away, doubt, m)
     own = signs.take([2 * i + 1 for i in range(m)])
-    # -1 where the other side than the evader's own is followed, else +1.
+    # -1 where the chosen side is not the one the evader is on, else +1.
     kept = (_SMALLEST - _crosses(graph, margins, own * sides)).apply("Sign")
     chosen = own * kept
     offsets = middle + kept * half
@@ -177,14 +178,15 @@ def _towards_pursuers(
 
 
 def _bends(graph: Graph, constants: Constants, shares: Tensor, m: int) -> Tensor:
-    """By how much n, in the quadrant ahead and left, lies beyond the tangent's direction: n = (cos S - first,
-    sin S + second), since it points along z beyond the usable angle S. `shares` is |z| by its length."""
+    """Deviation of n from the tangent's normal, in the quadrant ahead and left: n = (cos S - first, sin S +
+    second). It is 0 within the usable angle S; beyond it n points along z. `shares` is |z| over its
+    length."""
     limits = np.tile([constants.cosine, -constants.sine], m)
     return graph.linear(shares, for_each(m, np.diag([-1.0, 1.0])), limits).apply("Relu")
 
 
 def _doubt(graph: Graph, constants: Constants, scene: Scene, away: Tensor) -> Tensor:
-    """How much of the evader's distance from the axis (m) is in doubt, at most all of it, `(batch, m)`."""
+    """Uncertainty (m) of the evader's distance from the axis, at most that distance, `(batch, m)`."""
     m = scene.pursuers
     lengths = picks(scene.robots, *({i: constants.heading_doubt} for i in range(m)))
     return graph.least(
@@ -196,11 +198,11 @@ def _doubt(graph: Graph, constants: Constants, scene: Scene, away: Tensor) -> Te
 def _both_sides(
     graph: Graph, constants: Constants, bends: Tensor, away: Tensor, doubt: Tensor | None, m: int
 ) -> list[Tensor]:
-    """What is to be known of either side of each pursuer's axis, the other one and the evader's own, each
-    `(batch, m)`: the middle and half the difference of their rows' offsets, and the margins of `_crosses`.
+    """Mean and half difference of the row offsets for the two sides of each pursuer's axis, and the margins
+    of `_crosses`; each `(batch, m)`.
 
-    Everything here is piecewise linear in the products of n and z: two layers, as in a network, with the
-    positive part between them. |a| = (a)+ + (-a)+, max(a, b) = b + (a - b)+ and so on.
+    All are piecewise linear in the products of n and z, and computed as a network of two layers with ReLU:
+    |a| = (a)+ + (-a)+, max(a, b) = b + (a - b)+, and so on.
     """
     cosine, sine = constants.cosine, constants.sine
     normal = graph.linear(
@@ -217,7 +219,7 @@ def _both_sides(
     used = sum(widths)
     first = np.zeros((used * m, m * inner.shape[1]))
     first[places] = for_each(m, inner[:used])
-    # By quantity, then by pursuer.
+    # Ordered by quantity, then by pursuer.
     second = (
         for_each(m, outer[:-1])
         .reshape(-1, m, outer.shape[1])
@@ -230,9 +232,9 @@ def _both_sides(
 
 
 def _layers(constants: Constants) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the two layers for one pursuer, a row per input, the last one the bias.
+    """Weights of the two layers for one pursuer: a row per input, then the bias.
 
-    Inputs: n_x x, n_x y, n_y x, n_y y, the two of `_bends`, x and y of |z|, the doubt.
+    Inputs: n_x x, n_x y, n_y x, n_y y, both values of `_bends`, x and y of |z|, the result of `_doubt`.
     """
     one = np.eye(10)
     n_x_x, n_x_y, n_y_x, n_y_y, bend, _, ahead, aside, doubt, unit = one
@@ -293,8 +295,8 @@ def _layers(constants: Constants) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crosses(graph: Graph, margins: list[Tensor], same: Tensor) -> Tensor:
-    """More than 0 where the side of the memory is not the evader's own (`same` is -1) and is kept all the
-    same: the least of what is left of each condition, and the largest where one of two suffices."""
+    """Positive where the remembered side differs from the evader's side (`same` is -1) and is kept. It is the
+    minimum over the conditions' margins, or the maximum where one of two conditions suffices."""
     in_front, other, other_reach, lost, lost_reach, narrow = margins
     feasible = graph.least(other, other_reach)
     hopeless = graph.least(graph.largest(lost, lost_reach), narrow)

@@ -1,8 +1,8 @@
-"""How do the robots come into a graph?
+"""The robots as inputs of a graph.
 
-As rows of four numbers, seen from the evader: pursuers (x, y, heading, 0), then obstacles (x, y, vx, vy),
-then the target (x, y, 0, 0) where a policy asks for it. What comes in and is no number is replaced here,
-once, by a robot so far off that it matters to nobody; the status tells of it in the end.
+Rows of four numbers relative to the evader: pursuers (x, y, heading, 0), obstacles (x, y, vx, vy), and the
+target (x, y, 0, 0) if a policy needs it. A robot with non-finite input is replaced by one so far away that it
+has no effect; the status reports it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from sidestep.bridges.export.graph import Graph, Tensor
 from sidestep.world import Scenario
 
 NO_NUMBER = 1e15
-"""Coordinates whose absolute values sum up to this (m) count as not finite: their squares would overflow."""
+"""If the absolute coordinates sum to this (m) or more they count as not finite: their squares overflow."""
 _FAR = 1e6
 TINY = 1e-20
-"""A distance (m) that decides only where there is nothing else."""
+"""A distance (m) that has an effect only where all others are 0."""
 
 
 def picks(inputs: int, *columns: Mapping[int, float]) -> np.ndarray:
-    """Weights of `Graph.linear` by column: which of the `inputs` are added up, and how often."""
+    """Weights for `Graph.linear`: one mapping from input index to factor per column."""
     weights = np.zeros((inputs, len(columns)))
     for column, terms in enumerate(columns):
         for index, weight in terms.items():
@@ -32,16 +32,16 @@ def picks(inputs: int, *columns: Mapping[int, float]) -> np.ndarray:
 
 
 def for_each(count: int, weights: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
-    """The same weights for each of `count` robots, whose numbers follow one another."""
+    """Block-diagonal weights: the same block for each of `count` robots."""
     return np.kron(np.eye(count), np.asarray(weights))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The robots of a batch of worlds, all in world axes relative to the evader.
+    """The robots of a batch of worlds, in world axes relative to the evader.
 
-    **Attributes:** `rows (batch, robots, 4)`, all finite; `pursuers` m and `obstacles` k of them, the target
-    behind if `has_target`; `valid (batch, 1)` 1.0 where everything that came in was finite, else 0.0.
+    **Attributes:** `rows (batch, robots, 4)`, all finite: m `pursuers`, k `obstacles`, and the target if
+    `has_target`; `valid (batch, 1)`, 1.0 where all inputs were finite, else 0.0.
     """
 
     graph: Graph
@@ -53,22 +53,22 @@ class Scene:
 
     @property
     def count(self) -> int:
-        """Pursuers and obstacles."""
+        """Number of pursuers and obstacles."""
         return self.pursuers + self.obstacles
 
     @property
     def robots(self) -> int:
-        """Rows: those, and the target if there is one."""
+        """Number of rows: pursuers, obstacles, and the target if there is one."""
         return self.count + self.has_target
 
     @property
     def flat(self) -> Tensor:
-        """The rows one after the other, `(batch, 4 robots)`."""
+        """The rows concatenated, `(batch, 4 robots)`."""
         return self.rows.reshape(0, 4 * self.robots)
 
     @property
     def distances(self) -> Tensor:
-        """From the evader to each, `(batch, robots)` in m."""
+        """Distances from the evader, `(batch, robots)` in m."""
         squares = self.flat * self.flat
         return self.graph.linear(squares, for_each(self.robots, [[1.0], [1.0], [0.0], [0.0]])).apply("Sqrt")
 
@@ -82,8 +82,7 @@ class Scene:
         """Vectors from the evader, `(batch, 2 robots + 2 k)`: to pursuers and obstacles p/(1 + |p|), then
         unit vectors to the target (if there is one) and to the obstacles.
 
-        Where the evader is upon it, the direction is +x to the target and -x to an obstacle, as observation
-        and barrier have it.
+        At distance 0 the direction is +x to the target and -x to an obstacle, as in observation and barrier.
         """
         n, m, t = self.count, self.pursuers, int(self.has_target)
         whole = list(range(n, n + t)) + list(range(m, n))
@@ -107,7 +106,7 @@ def read_scene(graph: Graph, scenario: Scenario, *, target: bool) -> Scene:
     padded = np.eye(2, 4)
     evader = graph.linear(graph.input("evader", "batch", 2), np.tile(padded, robots)).reshape(0, robots, 4)
     rows = [graph.op("Pad", graph.input("pursuers", "batch", m, 3), np.array([0, 0, 0, 0, 0, 1]))]
-    # Away from the evader faster than it is far: no gain makes a row out of that.
+    # A replaced obstacle moves away faster (m/s) than it is far (m): its row is inactive for any gain.
     nowhere = [[0.0, -_FAR, 0.0, 0.0]] * m + [[_FAR, 0.0, _FAR, 0.0]] * k
     if k:
         rows.append(graph.input("obstacles", "batch", k, 4))

@@ -1,4 +1,4 @@
-"""Compiled programs that are called thousands of times a second: what may be flat, is."""
+"""Compiled programs that are called thousands of times a second, with few and flat arrays as arguments."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _PERIODS = _STATUSES * 2 ** len(FLAGS)
 
 
 class Bundle(NamedTuple):
-    """How a tree was laid out in one vector: its structure, and the shape of each leaf that is in there."""
+    """The layout of a tree in one vector: its structure, and the shape of each leaf in the vector."""
 
     structure: Any
     shapes: tuple[tuple[int, ...] | None, ...]
 
 
 def bundle_of(tree: Any) -> Bundle:
-    """How `bundled` lays out a tree of arrays, or of their shapes."""
+    """The layout `bundled` uses for a tree of arrays, or of their shapes."""
     leaves, structure = jax.tree.flatten(tree)
     default = real(0.0).dtype
     return Bundle(structure, tuple(leaf.shape if leaf.dtype == default else None for leaf in leaves))
 
 
 def bundled(tree: Any) -> list[Any]:
-    """A tree as few arrays: its leaves of the default float type end to end in one, the rest as they are."""
+    """A tree as few arrays: all leaves of the default float type as one vector, then the other leaves."""
     leaves, shapes = jax.tree.leaves(tree), bundle_of(tree).shapes
     inside = [leaf for leaf, shape in zip(leaves, shapes, strict=True) if shape is not None]
     rest = [leaf for leaf, shape in zip(leaves, shapes, strict=True) if shape is None]
@@ -43,7 +43,7 @@ def bundled(tree: Any) -> list[Any]:
 
 
 def unbundled(parts: list[Any], bundle: Bundle) -> Any:
-    """The tree again."""
+    """The inverse of `bundled`."""
     vector, *rest = parts
     blank = [jnp.zeros(shape, dtype=float) for shape in bundle.shapes if shape is not None]
     inside, others = iter(ravel_pytree(blank)[1](vector)), iter(rest)
@@ -53,11 +53,10 @@ def unbundled(parts: list[Any], bundle: Bundle) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def flat(function: Callable[..., Any], *layouts: Any) -> Callable[..., Any]:
-    """`function(*trees, *arguments)` compiled, to be called with a list of arrays for each tree.
+    """`function(*trees, *arguments)` compiled, to be called with a list of arrays per tree.
 
-    A layout is a `Bundle`, or the structure of a tree that is handed over leaf by leaf. JAX takes ten times
-    as long to look into a tree of modules, and a microsecond for every array. Two tasks of the same layout
-    get the same program.
+    A layout is a `Bundle`, or the structure of a tree passed as its leaves. JAX takes ten times as long to
+    flatten a tree of modules, and a microsecond per array. Tasks of equal layout share the program.
     """
 
     @jax.jit
@@ -72,7 +71,7 @@ def flat(function: Callable[..., Any], *layouts: Any) -> Callable[..., Any]:
 
 
 def packed(made: Decision) -> tuple[Float[Array, "9 *lanes"], Int[Array, "*lanes"]]:
-    """A decision as two arrays: each array that crosses over to NumPy costs some microseconds."""
+    """A decision as two arrays, because each array converted to NumPy costs some microseconds."""
     floats = jnp.stack(
         [
             made.reward,
@@ -91,7 +90,7 @@ def packed(made: Decision) -> tuple[Float[Array, "9 *lanes"], Int[Array, "*lanes
 
 
 def unpacked(floats: Any, whole: Any) -> tuple[Any, dict[str, Any]]:
-    """Reward and `info` of what `packed` made, each with an axis of lanes in front if there were any."""
+    """Reward and `info` from the arrays of `packed`, with the axis of lanes (if any) first."""
     floats, whole = np.asarray(floats), np.asarray(whole)
     flags = {name: (whole & 2**index) != 0 for index, name in enumerate(FLAGS)}
     return floats[0], {
@@ -109,8 +108,8 @@ def unpacked(floats: Any, whole: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def unpacked_one(floats: Any, whole: Any) -> tuple[float, bool, bool, dict[str, Any]]:
-    """Of one episode: reward, whether it is terminated, whether truncated, and `info` of plain numbers, as
-    Gymnasium's own environments give them, and arrays of its own."""
+    """Reward, terminated, truncated and `info` of one episode. `info` holds Python numbers, as in Gymnasium's
+    environments, and copies of arrays."""
     reward, info = unpacked(floats, whole)
     info = {name: value.item() if value.ndim == 0 else value.copy() for name, value in info.items()}
     truncated = info["timed_out"]
@@ -119,7 +118,7 @@ def unpacked_one(floats: Any, whole: Any) -> tuple[float, bool, bool, dict[str, 
 
 
 def seed_words(seeds: Any) -> np.ndarray:
-    """The words (2, n) of the random keys with these seeds: `jax.random.key(seed)`'s, below 2^32. Larger ones
-    are Gymnasium's own, drawn where none was given."""
+    """The words (2, n) of the random keys of these seeds: those of `jax.random.key(seed)` below 2^32. Larger
+    seeds are drawn by Gymnasium where none was given."""
     seeds = [int(seed) % 2**64 for seed in seeds]
     return np.array([[seed >> 32 for seed in seeds], [seed % 2**32 for seed in seeds]], np.uint32)

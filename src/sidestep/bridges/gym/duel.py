@@ -31,8 +31,8 @@ EVADER = "evader"
 _ROUNDING = 1e-5
 
 
-class _Told(eqx.Module):
-    """Pursuers that do as they are told."""
+class _CommandedPursuers(eqx.Module):
+    """Pursuers that drive the given wheel speeds (m/s)."""
 
     wheel_speeds: Float[Array, "m 2"]
 
@@ -44,11 +44,11 @@ class _Told(eqx.Module):
 
 
 def pursuer_observation(scenario: Scenario, world: World) -> Float[Array, "size"]:
-    """What `world.pursuer` sees, in its own frame (x ahead, y left), scaled to about [-1, 1].
+    """The observation of `world.pursuer` in its frame (x ahead, y left), scaled to about [-1, 1].
 
-    Per robot: position squashed p/(1 + |p|) (2), a second vector (2) and exp(-c/0.2) for the clearance c (m).
-    First the evader, with its velocity over v_e, then each obstacle, with the same, then each other pursuer,
-    with its heading (cos, sin). The target's squashed position (2) comes last.
+    Five entries per robot: position p/(1 + |p|) (2), a second vector (2) and exp(-c/0.2) for the clearance c
+    (m). The second vector is the velocity over v_e for the evader and for obstacles, and the heading (cos,
+    sin) for other pursuers. Order: evader, obstacles, other pursuers, then the target's p/(1 + |p|) (2).
     """
     pose = world.pursuer
 
@@ -81,7 +81,7 @@ def _pursuer_space(scenario: Scenario) -> spaces.Box:
     return spaces.Box(-high, high, dtype=np.float32)
 
 
-def _all_seen(task: Task, episode: EnvState) -> tuple[Any, Any]:
+def _observations(task: Task, episode: EnvState) -> tuple[Any, Any]:
     views = [
         pursuer_observation(task.scenario, episode.world.seen_by(index))
         for index in range(task.scenario.pursuer_count)
@@ -91,36 +91,36 @@ def _all_seen(task: Task, episode: EnvState) -> tuple[Any, Any]:
 
 def _begin(task: Task, words: Any, number: Any) -> tuple[Any, ...]:
     episode = begin(task, words, number)
-    return jax.tree.leaves(episode), *_all_seen(task, episode)
+    return jax.tree.leaves(episode), *_observations(task, episode)
 
 
 def _begin_in(task: Task, world: World, words: Any, number: Any) -> tuple[Any, ...]:
     episode = begin_in(task, world, words, number)
-    return jax.tree.leaves(episode), *_all_seen(task, episode)
+    return jax.tree.leaves(episode), *_observations(task, episode)
 
 
 def _step(task: Task, episode: EnvState, action: Any, wheels: Any) -> tuple[Any, ...]:
-    told = _Told(task.scenario.pursuer_speed * wheels)
-    episode, made = decide(eqx.tree_at(lambda task: task.pursuer, task, told), episode, action)
-    return jax.tree.leaves(episode), *_all_seen(task, episode), *packed(made)
+    pursuers = _CommandedPursuers(task.scenario.pursuer_speed * wheels)
+    episode, decision = decide(eqx.tree_at(lambda task: task.pursuer, task, pursuers), episode, action)
+    return jax.tree.leaves(episode), *_observations(task, episode), *packed(decision)
 
 
 @final
 class DuelEnv(pettingzoo.ParallelEnv):
-    """The evader and its pursuers, all of them learners, acting at once.
+    """A zero-sum game of the evader and its pursuers. All agents learn and act simultaneously.
 
     **Agents:** `evader`, as in `PursuedEnv`, behind `shield` (or `"none"`); and `pursuer`, or `pursuer_0`,
-    `pursuer_1`, ... if there are several. Their action in [-1, 1]^2 is the left and right wheel's rim speed
-    over `pursuer_speed`; they see what `pursuer_observation` says.
+    `pursuer_1`, ... if there are several. A pursuer's action in [-1, 1]^2 is the left and right wheel's rim
+    speed over `pursuer_speed`; its observation is `pursuer_observation`.
 
-    **Rewards** add up to zero: the evader gets the scenario's, less `capture_penalty` (the scenario's
-    `reach_reward` unless given) for a capture or collision, times `reward_scale`; each of the m pursuers the
-    negative of it, over m. An evader chased into an obstacle is as good as caught.
+    **Rewards** sum to zero. The evader's is the scenario's reward, less `capture_penalty` (by default the
+    scenario's `reach_reward`) for a capture or collision, times `reward_scale`. Each of the m pursuers gets
+    minus 1/m of it. A collision thus counts as a capture.
 
-    Arguments and `info` are otherwise those of `PursuedEnv`; an episode ends for all agents at once.
+    Other arguments and `info` as in `PursuedEnv`; an episode ends for all agents at once.
     """
 
-    # Each has its own, with its own pictures per second.
+    # Set for each environment, because `render_fps` depends on the task.
     metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "sidestep_duel_v0",
         "render_modes": ["human", "rgb_array"],
@@ -139,7 +139,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
         **fields: Any,
     ):
         if "pursuer" in fields:
-            raise ValueError("pursuer: here the pursuers are learners; PursuedEnv has one that is not")
+            raise ValueError("pursuer: in DuelEnv the pursuers learn; use PursuedEnv for a fixed strategy")
         self.render_mode = check_render_mode(render_mode)
         self.task = make_task(scenario, shield, "still", decision_steps, reward_scale, **fields)
         self.scenario = self.task.scenario
@@ -173,13 +173,14 @@ class DuelEnv(pettingzoo.ParallelEnv):
 
     @property
     def world(self) -> World:
-        """The world as it is now. **Raises** `gymnasium.error.ResetNeeded` before the first `reset`."""
+        """The current world. **Raises** `gymnasium.error.ResetNeeded` before the first `reset`."""
         if self._episode is None:
             raise gymnasium.error.ResetNeeded("call reset() before anything else")
         return jax.tree.unflatten(self._inner, self._episode).world
 
     def state(self) -> np.ndarray:
-        """Positions, headings and velocities of everybody in world axes, for critics that see everything."""
+        """The global state for centralised critics: all positions (m), headings (rad) and velocities (m/s) in
+        world axes."""
         world = self.world
         parts = (world.evader, world.evader_velocity, world.pursuers, world.obstacles, world.target)
         return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
@@ -194,7 +195,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
             self._words, self._number = seed_words([seed])[:, 0], -1
         self._number += 1
         number = np.asarray(self._number, np.int32)
-        # Others mean nothing here, and PettingZoo's own tests hand some over.
+        # Unknown options are ignored, because PettingZoo's tests pass some.
         if options and "world" in options:
             leaves, structure = jax.tree.flatten(given_world(self.scenario, options["world"]))
             made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
@@ -203,9 +204,9 @@ class DuelEnv(pettingzoo.ParallelEnv):
         self._episode, observation, views = made
         self.agents = list(self.possible_agents)
         self._screen.follow(lambda: self.world, begun=True)
-        return self._told(observation, views), {agent: {} for agent in self.agents}
+        return self._by_agent(observation, views), {agent: {} for agent in self.agents}
 
-    def _told(self, observation: Any, views: Any) -> dict[str, np.ndarray]:
+    def _by_agent(self, observation: Any, views: Any) -> dict[str, np.ndarray]:
         return {EVADER: np.array(observation), **dict(zip(self.pursuers, np.array(views), strict=True))}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -216,8 +217,8 @@ class DuelEnv(pettingzoo.ParallelEnv):
             raise ValueError(f"no action for {', '.join(missing)}")
         wheels = np.stack([checked_action(actions[agent], (2,)) for agent in self.pursuers])
         assert self._episode is not None
-        program, told = flat(_step, self._layout, self._inner), checked_action(actions[EVADER], (2,))
-        made = program((self._task, self._episode), told, wheels)
+        program, action = flat(_step, self._layout, self._inner), checked_action(actions[EVADER], (2,))
+        made = program((self._task, self._episode), action, wheels)
         self._episode, observation, views, floats, whole = made
         reward, terminated, truncated, info = unpacked_one(floats, whole)
         gained = reward - self._penalty * info["cost"]
@@ -227,7 +228,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
         if terminated or truncated:
             self.agents = []
         return (
-            self._told(observation, views),
+            self._by_agent(observation, views),
             {EVADER: gained, **shares},
             dict.fromkeys(everybody, terminated),
             dict.fromkeys(everybody, truncated),
@@ -235,7 +236,7 @@ class DuelEnv(pettingzoo.ParallelEnv):
         )
 
     def render(self) -> np.ndarray | None:
-        """The scene as pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""
+        """The scene as pixels (height, width, 3) with `rgb_array`; None with `human`, which uses a window."""
         return self._screen.pixels()
 
     def close(self) -> None:
@@ -246,12 +247,12 @@ ID = "sidestep/Duel-v0"
 
 
 def parallel_env(**arguments: Any) -> DuelEnv:
-    """A `DuelEnv`, by the name that PettingZoo's modules give it."""
+    """A `DuelEnv`; the constructor's name in PettingZoo modules."""
     return DuelEnv(**arguments)
 
 
 def env(**arguments: Any) -> Any:
-    """The same with one agent acting after the other, as PettingZoo's AEC environments do."""
+    """A `DuelEnv` as a PettingZoo AEC environment, in which agents act in turn."""
     from pettingzoo.utils import wrappers
     from pettingzoo.utils.conversions import parallel_to_aec
 

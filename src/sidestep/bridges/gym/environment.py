@@ -36,26 +36,26 @@ def _step(task: Task, episode: EnvState, action: Any) -> tuple[list[Any], Any, A
 
 @final
 class PursuedEnv(gymnasium.Env):
-    """`sidestep/Pursued-v0`: reach the target while somebody hunts you, with a shield that keeps you free.
+    """`sidestep/Pursued-v0`: the evader must reach its target while pursuers chase it, behind a shield.
 
     Arguments are those of `make_task`: `scenario` (with its fields by name), `shield`, `pursuer`,
     `decision_steps` control periods per step, `reward_scale`; and `render_mode`.
 
-    - The observation is the scenario's (`sidestep.observe`), the action the wished velocity over the evader's
+    - The observation is that of `sidestep.observe`. The action is the nominal velocity over the evader's
       speed, in the same axes.
-    - `terminated` is true when captured, collided or at the target, `truncated` when the scenario's
-      `episode_steps` control periods are over.
+    - `terminated` is true when captured, collided or at the target, `truncated` after the scenario's
+      `episode_steps` control periods.
     - The reward is the scenario's, summed over the step's control periods, times `reward_scale`.
     - `info` has `cost` (1.0 for a capture or collision), the flags `captured`, `collided`, `reached` and
-      `timed_out`, the shield's worst `status` of the step and its mean `intervention` (m/s), the action
-      `proposed` and the mean one `executed`, the least `pursuer_clearance` and `obstacle_clearance` (m), and
-      the control `periods` lived through, and `pursuer_invalid`, those of them in which a pursuer's wheel
+      `timed_out`, the shield's worst `status` and mean `intervention` (m/s) of the step, the action
+      `proposed` and the mean action `executed`, the least `pursuer_clearance` and `obstacle_clearance` (m),
+      the number of control `periods` simulated, and `pursuer_invalid`: those in which a pursuer's wheel
       speeds were not finite and it stood still.
     - `reset(seed=s)` begins episode 0 of `sidestep.evaluate(..., key=s)`, each further `reset()` the next.
       `reset(options={"world": ...})` starts in a given `World`, or in a mapping of its parts.
     """
 
-    # Each has its own, with its own pictures per second.
+    # Set for each environment, because `render_fps` depends on the task.
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
@@ -100,7 +100,7 @@ class PursuedEnv(gymnasium.Env):
     def __deepcopy__(self, memo: dict[int, Any]) -> PursuedEnv:
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
-        # Arrays never change, so the two may share them.
+        # Arrays are immutable, so both may share them.
         shared = {name: self.__getstate__()[name] for name in ("task", "scenario", "_episode")}
         rest = {name: value for name, value in self.__getstate__().items() if name not in shared}
         twin.__setstate__({**copy.deepcopy(rest, memo), **shared})
@@ -108,7 +108,7 @@ class PursuedEnv(gymnasium.Env):
 
     @property
     def world(self) -> World:
-        """The world as it is now. **Raises** `gymnasium.error.ResetNeeded` before the first `reset`."""
+        """The current world. **Raises** `gymnasium.error.ResetNeeded` before the first `reset`."""
         return jax.tree.unflatten(self._inner, self._now()).world
 
     def _now(self) -> list[Any]:
@@ -119,7 +119,7 @@ class PursuedEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        told = checked_options(options, "world")
+        options = checked_options(options, "world")
         if seed is not None:
             seed_number(seed)
         super().reset(seed=seed)
@@ -127,8 +127,8 @@ class PursuedEnv(gymnasium.Env):
             self._words, self._number = seed_words([self.np_random_seed])[:, 0], -1
         self._number += 1
         number = np.asarray(self._number, np.int32)
-        if "world" in told:
-            world = given_world(self.scenario, told["world"])
+        if "world" in options:
+            world = given_world(self.scenario, options["world"])
             leaves, structure = jax.tree.flatten(world)
             made = flat(_begin_in, self._layout, structure)((self._task, leaves), self._words, number)
         else:
@@ -150,7 +150,7 @@ class PursuedEnv(gymnasium.Env):
         return np.array(observation), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The scene as an array of pixels (height, width, 3) with `rgb_array`; `human` shows it by itself."""
+        """The scene as pixels (height, width, 3) with `rgb_array`; None with `human`, which uses a window."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() shows nothing without a render_mode: give one to gymnasium.make")
             return None

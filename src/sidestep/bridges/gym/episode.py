@@ -24,10 +24,10 @@ from sidestep.world.robots import limit_speed
 
 
 class EnvState(eqx.Module):
-    """Where the episode of an environment is, between two decisions.
+    """The state of an environment's episode between two decisions.
 
-    **Attributes:** `world`, the shield's `memory`, the two `words` of the environment's random key, the
-    `number` of the episode, the control `periods` that it has lasted.
+    **Attributes:** `world`; the shield's `memory`; the two `words` of the environment's random key; the
+    `number` of the episode; the control `periods` since its start.
     """
 
     world: World
@@ -38,11 +38,11 @@ class EnvState(eqx.Module):
 
 
 class Decision(eqx.Module):
-    """What came of one decision, over all the control periods for which its action was held.
+    """The result of one decision, over all control periods for which its action was held.
 
     **Attributes:** `reward` summed; the flags of `Events`; the worst `status`; `intervention` (m/s, mean);
-    `proposed` and `executed` (mean) in the policy's units and axes; the least clearances (m); `periods`
-    lived through, and `pursuer_invalid` those of them in which a pursuer's wheel speeds were not finite.
+    `proposed` and `executed` (mean) in the policy's units and axes; the least clearances (m); the number of
+    `periods` simulated, and `pursuer_invalid`: those in which a pursuer's wheel speeds were not finite.
     """
 
     reward: Lanes
@@ -70,7 +70,7 @@ def _keys(words: Any, number: Any) -> tuple[Any, Any]:
 
 
 def begin(task: GymTask, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray, "*lanes"]) -> EnvState:
-    """The start of episode `number` of the environment with these words for a random key."""
+    """The start of episode `number` of an environment with these words of its random key."""
     lanes = number.ndim
     world = lane_by_lane(lambda *of: task.scenario.reset(_keys(*of)[0]), lanes, words, number)
     return begin_in(task, world, words, number)
@@ -79,7 +79,7 @@ def begin(task: GymTask, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArr
 def begin_in(
     task: GymTask, world: World, words: UInt32[AnyArray, "2 *lanes"], number: Int[AnyArray, "*lanes"]
 ) -> EnvState:
-    """The same, but in a given world."""
+    """The start of the episode in a given world."""
     number = jnp.asarray(number, jnp.int32)
     return EnvState(
         world, start_in_lanes(task.shield, world), jnp.asarray(words), number, jnp.zeros_like(number)
@@ -91,12 +91,12 @@ def decide(
 ) -> tuple[EnvState, Decision]:
     """Hold an action in [-1, 1]^2 for `task.decision_steps` control periods, or until the episode ends.
 
-    The velocity that it asks for stays the same in world axes; the shield corrects it in every period.
+    The nominal velocity is constant in world axes; the shield filters it in every period.
     """
     scenario, start = task.scenario, episode.world
     action = real(action)
     nominal, finite = nominal_velocity(scenario, start, action), jnp.all(jnp.isfinite(action), axis=0)
-    # Unused, and so not computed, where the pursuer draws nothing.
+    # XLA removes these unless the pursuer draws random numbers.
     keys = lane_by_lane(lambda *of: _keys(*of)[1], start.lanes, episode.words, episode.number)
     run = Task(scenario, None, task.shield, task.pursuer)
 
@@ -132,5 +132,5 @@ def decide(
 
 
 def seen(task: GymTask, episode: EnvState) -> Float[Array, "*lanes observation"]:
-    """The observation in single precision, worlds first, as learners take it."""
+    """The observation in float32, with the axis of lanes first."""
     return jnp.moveaxis(observe(task.scenario, episode.world), 0, -1).astype(jnp.float32)

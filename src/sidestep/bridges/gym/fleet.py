@@ -1,8 +1,8 @@
-"""Many episodes side by side, each followed by the next: one decision of all of them in one compiled call.
+"""Many episodes in lanes, with automatic resets: one decision of all lanes in one compiled call.
 
-Drawing a start takes longer than a decision, and with a thousand worlds some episode ends almost every time.
-So each lane has its next starts at hand, and new ones are drawn, for all lanes at once, only when a lane has
-used up its own.
+Drawing a start takes longer than a decision, and with a thousand lanes an episode ends in almost every step.
+Each lane therefore keeps its next starts in a buffer. When one lane's buffer is empty, starts are drawn for
+all lanes at once.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from sidestep.bridges.gym.task import Task
 from sidestep.world import World
 
 NEXT_STEP, SAME_STEP, DISABLED = "NextStep", "SameStep", "Disabled"
-"""When an episode that has ended is followed by the next one: `gymnasium.vector.AutoresetMode`'s values."""
+"""When the next episode begins after one has ended: the values of `gymnasium.vector.AutoresetMode`."""
 AHEAD = 3
-"""Next episodes that each lane has at hand."""
+"""Buffered starts per lane."""
 
 
 class Fleet(eqx.Module):
-    """Lanes of episodes, and which of them have ended."""
+    """The episodes of all lanes, and which of them have ended."""
 
     episode: EnvState
     ended: Bool[Array, "lanes"]
 
 
 class Step(eqx.Module):
-    """What a step shows: `observation` of where the lanes are now, `final` of where those that ended were
-    (with `SAME_STEP` only), and what the `decision` came to."""
+    """The result of a step: the current `observation`, the `final` observation of episodes that ended (with
+    `SAME_STEP` only), and the `decision`."""
 
     observation: Float[Array, "lanes observation"]
     final: Float[Array, "lanes observation"] | None
@@ -42,26 +42,26 @@ class Step(eqx.Module):
 
 
 def launch(task: Task, words: UInt32[AnyArray, "2 lanes"], number: Int[AnyArray, "lanes"]) -> Fleet:
-    """All lanes at the start of the episodes with these numbers."""
+    """Start the episodes with these numbers in all lanes."""
     return Fleet(begin(task, words, number), jnp.zeros(number.shape, bool))
 
 
 def place(task: Task, fleet: Fleet, world: World) -> Fleet:
-    """All lanes at the start of an episode in given worlds (in lanes)."""
+    """Start an episode in each lane in the given worlds (in lanes)."""
     episode = begin_in(task, world, fleet.episode.words, fleet.episode.number)
     return Fleet(episode, jnp.zeros_like(fleet.ended))
 
 
 class Spares(eqx.Module):
-    """Worlds in which the next episodes of each lane start, and the shield's memories there: `AHEAD` of them
-    in front of all other axes, that of episode n at n modulo `AHEAD`."""
+    """Buffered starts of each lane's next episodes: worlds and the shield's memories. Their first axis has
+    size `AHEAD`; episode n is at index n modulo `AHEAD`."""
 
     world: Any
     memory: Any
 
 
 def no_spares(fleet: Fleet) -> Spares:
-    """Room for them."""
+    """An empty buffer for this fleet."""
     starts = Spares(fleet.episode.world, fleet.episode.memory)
     return jax.tree.map(lambda leaf: jnp.zeros((AHEAD, *leaf.shape), leaf.dtype), starts)
 
@@ -73,8 +73,7 @@ def draw(
     lanes: Int[AnyArray, "several"],
     numbers: Int[AnyArray, "several"],
 ) -> Spares:
-    """The spares with the starts of these episodes of these lanes among them; lanes that do not exist draw
-    nothing."""
+    """Draw the starts of these episodes into the buffers of these lanes; lanes out of range are ignored."""
     lanes, numbers = jnp.asarray(lanes), jnp.asarray(numbers)
     words = fleet.episode.words[:, jnp.minimum(lanes, fleet.ended.shape[0] - 1)]
     drawn = begin(task, words, numbers)
@@ -86,7 +85,7 @@ def draw(
 
 
 def follow(fleet: Fleet, spares: Spares, where: Bool[AnyArray, "lanes"]) -> Fleet:
-    """The next episode, which must be among the spares, in these lanes."""
+    """Begin the next episode in these lanes; its start must be in the buffer."""
     where, now = jnp.asarray(where), fleet.episode
     slot = (now.number + 1) % AHEAD
     spare = jax.tree.map(lambda leaf: leaf[0], spares)
@@ -106,11 +105,11 @@ def follow(fleet: Fleet, spares: Spares, where: Bool[AnyArray, "lanes"]) -> Flee
 def step(
     task: Task, mode: str, fleet: Fleet, spares: Spares | None, actions: Float[AnyArray, "lanes 2"]
 ) -> tuple[Fleet, Step]:
-    """One decision in every lane, and the next episode where one has ended, as `mode` says."""
+    """One decision in every lane; ended episodes are followed by the next according to `mode`."""
     actions = jnp.moveaxis(jnp.asarray(actions), -1, 0)
     begun, episode, final = fleet.ended, fleet.episode, None
     if mode == NEXT_STEP:
-        # What they do is thrown away: it should not cost a shield that thinks long when it is close.
+        # Their step is discarded: far from everything, a shield with look-ahead decides quickly.
         episode = eqx.tree_at(lambda e: e.world, episode, episode.world.set_apart(begun))
     episode, decision = decide(task, episode, actions)
     fleet = Fleet(episode, decision.ended)

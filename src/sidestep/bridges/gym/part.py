@@ -1,4 +1,4 @@
-"""Some of the worlds of a vector environment: those that one thread steps."""
+"""The worlds of a vector environment that one thread steps."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def _leaves(tree: Any) -> list[Any]:
 
 def _stepper(mode: str) -> Any:
     def step(task: Task, fleet: Fleet, spares: Spares, actions: Any) -> tuple[Any, ...]:
-        fleet, made = fleets.step(task, mode, fleet, spares, actions)
-        return _leaves(fleet), made.observation, made.final, *packed(made.decision)
+        fleet, result = fleets.step(task, mode, fleet, spares, actions)
+        return _leaves(fleet), result.observation, result.final, *packed(result.decision)
 
     return step
 
@@ -52,7 +52,8 @@ _STEP = {mode: _stepper(mode) for mode in (fleets.NEXT_STEP, fleets.SAME_STEP, f
 
 @final
 class Part:
-    """The worlds of one thread: `where` among all of them, in the compiled programs' own layout."""
+    """The worlds of one thread, in the layout of the compiled programs. `where` is their slice of all
+    worlds."""
 
     def __init__(self, task: Task, mode: str, where: slice):
         self.where, self.size = where, where.stop - where.start
@@ -64,14 +65,14 @@ class Part:
 
     @property
     def world(self) -> World:
-        """The worlds as they are now, in lanes."""
+        """The current worlds, in lanes."""
         return jax.tree.unflatten(self._layouts[1], self._fleet).episode.world
 
     def _trees(self) -> tuple[list[Any], ...]:
         return self._task, self._fleet, self._spares
 
     def launch(self, words: Any, numbers: Any) -> np.ndarray:
-        """Begin these episodes; the observation. So do `place` and `follow`."""
+        """Begin these episodes; returns the observation, as `place` and `follow` do."""
         words, numbers = words[:, self.where], numbers[self.where]
         launch = flat(_launch, self._layout)
         self._fleet, self._spares, observation = launch((self._task,), words, numbers)
@@ -91,7 +92,7 @@ class Part:
         return np.asarray(observation)
 
     def draw(self, lanes: Any, numbers: Any) -> None:
-        """Draw the starts of these episodes, of these lanes of all worlds."""
+        """Draw the starts of these episodes; `lanes` are numbered over all worlds."""
         mine = (lanes >= self.where.start) & (lanes < self.where.stop)
         lanes, numbers = lanes[mine] - self.where.start, numbers[mine]
         draw, chunk = flat(_draw, *self._layouts), min(_DRAWN_AT_ONCE, AHEAD * self.size)
@@ -102,10 +103,10 @@ class Part:
             self._spares = draw(self._trees(), some[0], some[1])
 
     def program(self, actions: Any) -> tuple[Any, ...]:
-        """What a step computes, as arrays of the device, without taking the step."""
+        """Compute a step, as device arrays, without changing the state."""
         return flat(_STEP[self._mode], *self._layouts)(self._trees(), actions[self.where])
 
     def step(self, actions: Any) -> tuple[Any, ...]:
-        """Take a step: observation, final observation (with `SAME_STEP`), and what `packed` made."""
+        """Take a step; returns observation, final observation (with `SAME_STEP`) and arrays of `packed`."""
         self._fleet, *made = self.program(actions)
         return tuple(None if one is None else np.asarray(one) for one in made)

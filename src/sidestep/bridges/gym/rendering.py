@@ -1,4 +1,4 @@
-"""What does the scene look like now? A picture as an array, or in a window."""
+"""Render the current scene as an array of pixels or in a window."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _VISIBLE = 1e-6
 
 
 def check_render_mode(mode: str | None) -> str | None:
-    """The mode itself. **Raises** `ValueError` for an unknown one, or when its package is missing."""
+    """Returns `mode`. **Raises** `ValueError` for an unknown mode, or when its package is missing."""
     if mode is not None and mode not in MODES:
         raise ValueError(f"render_mode = {mode!r}: it must be {' or '.join(map(repr, MODES))}, or None")
     if mode == "human":
@@ -38,7 +38,7 @@ def check_render_mode(mode: str | None) -> str | None:
 
 @final
 class Picture:
-    """The scene of an episode followed step by step: robots, distances, barrier, ways, corrections."""
+    """Draws an episode step by step: robots, clearances, barrier, paths and corrections."""
 
     def __init__(self, scenario: Scenario, shield: Any):
         self._scenario = scenario
@@ -49,26 +49,26 @@ class Picture:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the ways of an episode that is over."""
+        """Forget the paths of the last episode."""
         self._worlds: list[World] = []
         self._corrections: list[float] = []
         self._status, self._nominal = 0, np.zeros(2)
 
     def follow(self, world: World, info: dict[str, Any] | None = None) -> None:
-        """What has become of the world, and how, if that was a step's work."""
+        """Add a world, with the `info` of the step that led to it, if any."""
         if info is not None and self._worlds:
-            wish = np.asarray(info["proposed"], np.float32)
-            self._nominal = np.asarray(self._velocity(self._scenario, self._worlds[-1], wish), float)
+            action = np.asarray(info["proposed"], np.float32)
+            self._nominal = np.asarray(self._velocity(self._scenario, self._worlds[-1], action), float)
             self._status = info["status"]
             self._corrections.append(info["intervention"])
         self._worlds.append(world)
 
     def drawn(self) -> UInt8[np.ndarray, "height width 3"]:
         """The pixels."""
-        self._make_room()
+        self._fit_axes()
         now = self._instant()
         self._panel.show(now, None)
-        self._panel.show_trails(*self._ways())
+        self._panel.show_trails(*self._trails())
         answer = ANSWERS[self._status]
         self._words.set_text(f"{now.time:.1f} s    shield: {answer[1]}")
         self._canvas.restore_region(self._still)
@@ -78,7 +78,7 @@ class Picture:
         return np.array(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
     def show(self, rate: int) -> None:
-        """The pixels in a window, at most so many times a second."""
+        """Show the pixels in a window, at most `rate` times a second."""
         pygame = needed("pygame", "gym", "the render_mode 'human' needs")
         if self._window is None:
             pygame.display.init()
@@ -110,7 +110,7 @@ class Picture:
             action=np.asarray(world.evader_velocity, float),
         )
 
-    def _ways(self) -> tuple[Any, ...]:
+    def _trails(self) -> tuple[Any, ...]:
         evader = self._path("evader")
         others = [
             (path, colour)
@@ -126,8 +126,8 @@ class Picture:
     def _path(self, part: str) -> Float[np.ndarray, "n ..."]:
         return np.stack([np.asarray(getattr(world, part), float) for world in self._worlds])
 
-    def _make_room(self) -> None:
-        """Axes in which everybody is to be seen; they widen in steps, so that pictures do not jitter."""
+    def _fit_axes(self) -> None:
+        """Widen the axes until all robots are visible; in steps, so that pictures do not jitter."""
         world = self._worlds[-1]
         places = [world.evader, world.target, *world.pursuers[:, :2], *world.obstacles[:, :2]]
         reach = max(float(np.abs(place).max()) for place in places) + _MARGIN
@@ -157,7 +157,7 @@ class Picture:
 
 @final
 class Screen:
-    """What an environment shows of its episode as it goes, by its render mode; nothing without one."""
+    """Renders an environment's episode according to its render mode; nothing if that is None."""
 
     def __init__(self, mode: str | None, scenario: Scenario, shield: Any, rate: int):
         self._mode, self._about, self._rate = mode, (scenario, shield), rate
@@ -166,8 +166,7 @@ class Screen:
     def follow(
         self, world: Callable[[], World], info: dict[str, Any] | None = None, *, begun: bool = False
     ) -> None:
-        """Keep what a picture needs of `world()`, the first of an episode if it has `begun`; with `human`,
-        show it."""
+        """Add `world()`, the first of an episode if `begun`; with `human`, show it."""
         if self._mode is None:
             return
         if self._picture is None:
@@ -179,7 +178,7 @@ class Screen:
             self._picture.show(self._rate)
 
     def pixels(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """The picture with `rgb_array`, once there is something to see; else None."""
+        """The pixels with `rgb_array` once an episode has begun, else None."""
         return self._picture.drawn() if self._picture is not None and self._mode == "rgb_array" else None
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What observations and actions look like to Gymnasium."""
+"""Gymnasium spaces of observations and actions."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _ROUNDING = 1e-5
 
 
 def observation_space(scenario: Scenario) -> spaces.Box:
-    """The space of `sidestep.observe`: all entries within [-1, 1] (to rounding), but an obstacle's velocity,
-    in units of the evader's speed, as large as the scenario makes it."""
+    """The space of `sidestep.observe`. All entries are within [-1, 1] (to rounding), except an obstacle's
+    velocity over the evader's speed, which may be larger."""
     drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity)) / np.asarray(scenario.evader_speed))
     widest = [
         max(1.0, drift) if name.endswith(("_vx", "_vy")) else 1.0 for name in observation_names(scenario)
@@ -24,13 +24,13 @@ def observation_space(scenario: Scenario) -> spaces.Box:
 
 
 def action_space() -> spaces.Box:
-    """[-1, 1]^2: the wished velocity over the evader's speed, in the axes of the scenario's `frame`; its norm
-    is cut to one."""
+    """[-1, 1]^2: the nominal velocity over the evader's speed, in the axes of the scenario's `frame`; its
+    norm is clipped to 1."""
     return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
 def checked_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """The action as an array. **Raises** `ValueError` for another shape."""
+    """The action as an array. **Raises** `ValueError` for a wrong shape."""
     array = np.asarray(action, np.float32)
     if array.shape != shape:
         raise ValueError(f"an action here has shape {shape}, not {array.shape}")

@@ -1,4 +1,4 @@
-"""Many worlds for Stable-Baselines3 and SBX, which have a form of their own for vector environments."""
+"""The vector environment in the interface of Stable-Baselines3 and SBX."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ except ImportError as error:
 
 @final
 class PursuedVecEnv(_VecEnv):
-    """`PursuedVectorEnv` as a Stable-Baselines3 `VecEnv`; arguments as there, without `autoreset_mode`.
+    """`PursuedVectorEnv` as a Stable-Baselines3 `VecEnv`; same arguments, without `autoreset_mode`.
 
-    An episode that has ended is followed by the next one at once, as Stable-Baselines3 wants it. The infos of
-    worlds in which one has just ended hold what those of `PursuedEnv` do, `terminal_observation`, and
-    `TimeLimit.truncated` for its learners to bootstrap through; those of all others hold only `cost`, unless
-    `every_info` is set: with a thousand worlds, making them takes ten times as long as the step itself.
+    The next episode begins at once when one ends. Where an episode has just ended, the info holds that of
+    `PursuedEnv`, `terminal_observation`, and `TimeLimit.truncated`, through which learners bootstrap. Other
+    infos hold only `cost` unless `every_info` is set: with a thousand worlds, full infos take ten times as
+    long as the step.
     """
 
     def __init__(self, num_envs: int = 1, *, every_info: bool = False, **arguments: Any):
         if "autoreset_mode" in arguments:
-            raise ValueError("autoreset_mode: Stable-Baselines3 has only one, leave it out")
+            raise ValueError("autoreset_mode: Stable-Baselines3 supports only one mode; leave it out")
         self.vector = PursuedVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
         self.render_mode = self.vector.render_mode
         self._every_info = every_info
@@ -43,7 +43,7 @@ class PursuedVecEnv(_VecEnv):
         )
 
     def reset(self) -> np.ndarray:
-        """Begin episodes everywhere, with the seeds of `seed()` if it has been called since the last time."""
+        """Begin an episode in each world, with the seeds of `seed()` if called since the last reset."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = self._options[0] or None
         if any(other != self._options[0] for other in self._options):
@@ -55,20 +55,20 @@ class PursuedVecEnv(_VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take note of the actions (num_envs, 2)."""
+        """Store the actions (num_envs, 2)."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Take the step: observations, rewards, whether an episode ended, infos."""
-        observation, reward, terminated, truncated, told = self.vector.step(self._actions)
+        """Take the step; returns observations, rewards, dones and infos."""
+        observation, reward, terminated, truncated, info = self.vector.step(self._actions)
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{"cost": 0.0} for _ in range(self.num_envs)]
         if self._every_info:
-            infos = [_info(told, lane) for lane in range(self.num_envs)]
+            infos = [_info(info, lane) for lane in range(self.num_envs)]
         for lane in np.flatnonzero(done).tolist():
             infos[lane] = {
-                **_info(told["final_info"], lane),
-                "terminal_observation": told["final_obs"][lane],
+                **_info(info["final_info"], lane),
+                "terminal_observation": info["final_obs"][lane],
                 "TimeLimit.truncated": bool(truncated[lane]),
             }
         return observation, reward.astype(np.float32), done, infos
@@ -80,23 +80,25 @@ class PursuedVecEnv(_VecEnv):
         return self.vector.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """What `PursuedVectorEnv` has by this name, for each of the worlds: the same."""
+        """The attribute of `PursuedVectorEnv`, repeated for each world."""
         return [getattr(self.vector, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise AttributeError(f"{attr_name} cannot be set: all worlds are of one task, make another")
+        raise AttributeError(
+            f"{attr_name} cannot be set: all worlds share one task; make another environment"
+        )
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise AttributeError(f"{method_name} cannot be called on single worlds: they are stepped as one")
+        raise AttributeError(f"{method_name} cannot be called on single worlds: they are stepped together")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
 
 
-def _info(told: dict[str, Any], lane: int) -> dict[str, Any]:
-    """What a vector info says of one world."""
+def _info(vector_info: dict[str, Any], lane: int) -> dict[str, Any]:
+    """One world's entries of a vector info."""
     return {
         name: value[lane].item() if value.ndim == 1 else value[lane]
-        for name, value in told.items()
+        for name, value in vector_info.items()
         if not name.startswith(("_", "final_"))
     }

@@ -1,4 +1,4 @@
-"""What is to be learned: scenario, shield, pursuer, and for how long an action is held."""
+"""A learning problem: scenario, shield, pursuer, and for how long an action is held."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from sidestep.world import Scenario, load_scenario
 
 
 class Task(eqx.Module):
-    """One learning problem. Its numbers are traced: tasks that differ in them share their compiled programs.
+    """One learning problem. Its numbers are traced: tasks that differ only in numbers share compiled
+    programs.
 
-    **Attributes:** `scenario`; `shield`; `pursuer`; `reward_scale` by which the scenario's reward is
-    multiplied; `decision_steps` control periods for which an action is held.
+    **Attributes:** `scenario`; `shield`; `pursuer`; `reward_scale`, the factor on the scenario's reward;
+    `decision_steps`, the number of control periods for which an action is held.
     """
 
     scenario: Scenario
@@ -29,7 +30,7 @@ class Task(eqx.Module):
 
     @property
     def pictures_per_second(self) -> int:
-        """At which a picture per decision plays as fast as it happened; at least 1."""
+        """The frame rate at which one picture per decision plays in real time; at least 1."""
         return max(1, round(1.0 / (float(self.scenario.control_period) * self.decision_steps)))
 
 
@@ -41,7 +42,7 @@ def make_task(
     reward_scale: float = 1.0,
     **fields: Any,
 ) -> Task:
-    """A task from what the environments take.
+    """A task from the arguments of the environments.
 
     **Arguments:** `scenario` a preset, a file or a `Scenario`; `shield` a name or a `Shield`; `pursuer` a
     name, a `Pursuer` or a callable `(scenario, world, key) -> wheel speeds`; `fields` of the scenario by
@@ -65,5 +66,5 @@ def make_task(
         reward_scale=real(reward_scale),
         decision_steps=decision_steps,
     )
-    # A model of one's own may hold plain numbers.
+    # A custom model may hold Python numbers.
     return jax.tree.map(lambda leaf: real(leaf) if isinstance(leaf, (int, float)) else leaf, task)

@@ -1,4 +1,4 @@
-"""Many worlds as one Gymnasium vector environment, stepped in one compiled call for each core."""
+"""Many worlds as one Gymnasium vector environment, stepped in one compiled call per thread."""
 
 from __future__ import annotations
 
@@ -25,29 +25,30 @@ from sidestep.bridges.gym.worlds import checked_options, given_world
 from sidestep.pursuit.foreign import runs_on_host
 from sidestep.world import World
 
-_WORTH_A_THREAD = 2048
-"""Control periods of worlds in one step; handing them to another thread takes as long as half of them."""
-_THOUGHTFUL_WORTH = 32
-"""Worlds, behind a shield that thinks ahead."""
+_PERIODS_PER_THREAD = 2048
+"""Least number of control periods per thread and step; a thread's overhead costs about half as much."""
+_WORLDS_PER_THREAD = 32
+"""Least number of worlds per thread with a shield that looks ahead."""
 
 
 @final
 class PursuedVectorEnv(VectorEnv):
-    """`num_envs` worlds of `sidestep/Pursued-v0`, as `gymnasium.make_vec` makes them; arguments as there.
+    """`num_envs` worlds of `sidestep/Pursued-v0`, as from `gymnasium.make_vec`; arguments as in `PursuedEnv`.
 
-    `autoreset_mode` (an `AutoresetMode` or its value) says when an episode that has ended is followed by the
-    next: `NEXT_STEP` (Gymnasium's default) with the next step, whose action that world then ignores, with
-    reward 0; `SAME_STEP` at once, with the last observation and info in `info["final_obs"]` and
-    `info["final_info"]`; `DISABLED` when `reset(options={"reset_mask": mask})` says so.
+    `autoreset_mode` (an `AutoresetMode` or its value) selects when the next episode begins after one ends:
 
-    `reset(seed=s)` seeds world i with s + i; a list gives each its own. World i then goes through the same
+    - `NEXT_STEP` (Gymnasium's default): in the next step; that world ignores the action and gets reward 0
+    - `SAME_STEP`: at once; the last observation and info are in `info["final_obs"]` and `info["final_info"]`
+    - `DISABLED`: on `reset(options={"reset_mask": mask})`
+
+    `reset(seed=s)` seeds world i with s + i; a list gives one seed per world. World i then runs the same
     episodes as a `PursuedEnv` with that seed, to rounding.
 
-    The worlds are shared among `threads`, at most; if not given, among as many as there are cores and find
-    enough to do. How many there are changes nothing but the time.
+    `threads` is the largest number of threads; by default as many as there are cores and enough work for. It
+    changes only the speed.
     """
 
-    # Each has its own, with its own pictures per second.
+    # Set for each environment, because `render_fps` depends on the task.
     metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["rgb_array"],
         "render_fps": 20,
@@ -95,27 +96,28 @@ class PursuedVectorEnv(VectorEnv):
         self._pool: ThreadPoolExecutor | None = None
         self._compiled: set[str] = set()
         self._words = np.zeros((2, self.num_envs), np.uint32)
-        # Numbers of the episodes that run, and of the last one of each lane whose start has been drawn.
+        # Per lane: number of the running episode, and of the last episode whose start has been drawn.
         self._numbers = np.full(self.num_envs, -1, np.int32)
         self._drawn = self._numbers.copy()
         self._ended = np.ones(self.num_envs, bool)
         self._launched = False
 
     def _useful_threads(self, most: int | None) -> int:
-        """As many as find enough to do, in equal parts: each number of worlds compiles anew."""
+        """The number of threads with enough work each. It divides the worlds equally, because each batch size
+        compiles separately."""
         if most is not None:
             most = whole_number("threads", most)
         if runs_on_host(self.task.pursuer, self.scenario):
             return 1
         if self.task.shield.looks_ahead:
-            worth = self.num_envs // _THOUGHTFUL_WORTH
+            worth = self.num_envs // _WORLDS_PER_THREAD
         else:
-            worth = self.num_envs * self.task.decision_steps // _WORTH_A_THREAD
+            worth = self.num_envs * self.task.decision_steps // _PERIODS_PER_THREAD
         count = useful_threads(max(1, worth if most is None else min(most, self.num_envs)))
         return next(part for part in range(count, 0, -1) if self.num_envs % part == 0)
 
     def _each(self, name: str, work: Callable[[Part], Any]) -> list[Any]:
-        """Let every part do its work, in threads; the first time one by one: all compile the same."""
+        """Call `work` with each part, in threads; the first time in turn, to compile the program once."""
         first, *others = self._parts
         if not others or name not in self._compiled:
             self._compiled.add(name)
@@ -137,7 +139,7 @@ class PursuedVectorEnv(VectorEnv):
 
     @property
     def worlds(self) -> World:
-        """All worlds as they are now, with their axis in front. **Raises** `ResetNeeded` before a `reset`."""
+        """All current worlds, with their axis first. **Raises** `ResetNeeded` before a `reset`."""
         self._check_launched()
         worlds = [part.world for part in self._parts]
         return jax.tree.map(
@@ -151,24 +153,24 @@ class PursuedVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        told = checked_options(options, "world", "reset_mask")
-        if "reset_mask" in told:
-            if "world" in told:
+        options = checked_options(options, "world", "reset_mask")
+        if "reset_mask" in options:
+            if "world" in options:
                 raise ValueError("options: 'world' starts all worlds anew and takes no 'reset_mask'")
-            return self._reset_some(seed, told["reset_mask"])
+            return self._reset_some(seed, options["reset_mask"])
         fresh = self._seed(seed)
         self._numbers = np.where(fresh, 0, self._numbers + 1).astype(np.int32)
         self._drawn = self._numbers.copy()
         observations = self._each("launch", lambda part: part.launch(self._words, self._numbers))
         self._launched = True
-        if "world" in told:
-            world = given_world(self.scenario, told["world"], (self.num_envs,))
+        if "world" in options:
+            world = given_world(self.scenario, options["world"], (self.num_envs,))
             observations = self._each("place", lambda part: part.place(world))
         self._ended = np.zeros(self.num_envs, bool)
         return np.concatenate(observations), {}
 
     def _seed(self, seed: Any) -> np.ndarray:
-        """Take new seeds; which worlds got one."""
+        """Set the random keys; returns which worlds got a new one."""
         if seed is None and not self._launched:
             seed = self.np_random_seed
         elif isinstance(seed, (int, np.integer)):
@@ -211,7 +213,7 @@ class PursuedVectorEnv(VectorEnv):
         return np.concatenate(observations), {}
 
     def _draw_ahead(self) -> None:
-        """Draw the next starts of all lanes, if one has none left."""
+        """Draw the next starts of all lanes if one lane has none left."""
         if not np.any(self._drawn <= self._numbers):
             return
         ahead = self._drawn[:, None] + np.arange(1, AHEAD + 1, dtype=np.int32)
@@ -252,16 +254,16 @@ class PursuedVectorEnv(VectorEnv):
         return np.concatenate(observation), reward, terminated, truncated, info
 
     def program(self, actions: Float[np.ndarray, "worlds 2"]) -> list[tuple[Any, ...]]:
-        """What `step` computes, as arrays of the device and part by part, without taking the step."""
+        """What `step` computes, as device arrays per thread, without changing the state."""
         return self._each("step", lambda part: jax.block_until_ready(part.program(actions)))
 
     def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Vector infos: beside each entry, which worlds have it."""
+        """A vector info: each entry with its mask of worlds."""
         mask = np.ones(self.num_envs, bool) if mask is None else mask
         return {**info, **{f"_{name}": mask for name in info}}
 
     def _final(self, info: dict[str, Any], final: Any, ended: np.ndarray) -> dict[str, Any]:
-        """Infos of `SAME_STEP`: those of worlds whose episode ended are in `final_info`."""
+        """The vector info of `SAME_STEP`: worlds whose episode ended have theirs in `final_info`."""
         infos = self._masked(info, ~ended)
         if np.any(ended):
             kept = {name: value.copy() for name, value in info.items()}
@@ -280,7 +282,7 @@ class PursuedVectorEnv(VectorEnv):
         return infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """The scene of every world as pixels, without the ways that were taken."""
+        """The scene of every world as pixels, without paths."""
         if self.render_mode is None:
             return None
         worlds, pictures = self.worlds, []

@@ -1,4 +1,4 @@
-"""Worlds that `reset` is asked to start in."""
+"""Check the options of `reset`, such as the world to start in."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PARTS = ("evader", "pursuers", "obstacles", "target")
 
 
 def checked_options(options: Any, *known: str) -> dict[str, Any]:
-    """What `reset` was told. **Raises** `ValueError` for anything that it would not heed."""
+    """The options of `reset` as a dict. **Raises** `ValueError` for an unknown option."""
     options = {} if options is None else options
     unknown = [name for name in options if name not in known]
     if unknown:
@@ -24,12 +24,13 @@ def checked_options(options: Any, *known: str) -> dict[str, Any]:
 
 
 def given_world(scenario: Scenario, given: Any, lanes: tuple[int, ...] = ()) -> World:
-    """The world of `options={"world": ...}`: a `World`, or a mapping of `evader` (2,), `pursuers` (m, 3),
-    `obstacles` (k, 4) and `target` (2,), each with an axis of worlds in front if there are several. It starts
-    at time 0.
+    """The world of `options={"world": ...}`, at time 0, in lanes if there are several.
 
-    **Returns** it in lanes if there are several. **Raises** `ValueError` naming the part that is missing,
-    has the wrong shape or is not finite, and for an evader that is captured or collides to begin with.
+    **Arguments:** `given` a `World`, or a mapping with `evader` (2,), `pursuers` (m, 3), `obstacles` (k, 4)
+    and `target` (2,), each with a leading axis of worlds if there are several.
+
+    **Raises** `ValueError` for a part that is missing, has the wrong shape or is not finite, and for a start
+    in which the evader is captured or collides.
     """
     if not isinstance(given, (World, Mapping)):
         raise ValueError(f"options['world'] must be a World or a mapping, not a {type(given).__name__}")

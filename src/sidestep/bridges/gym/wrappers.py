@@ -1,4 +1,4 @@
-"""Wrappers: our shield around anyone's environment, and the step of six values that Safety-Gymnasium has."""
+"""Wrappers: a shield for any environment, and the six-value `step` of Safety-Gymnasium."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sidestep.world import World
 
 
 def in_lanes(worlds: World) -> World:
-    """Many worlds with their axis in front, as those that compute in lanes take them."""
+    """Worlds with their axis first, converted to lanes (axis last)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(real(leaf), 0, -1), worlds)
 
 
@@ -32,23 +32,24 @@ def _init(shield: Shield, world: World) -> Any:
 
 @final
 class ShieldWrapper(gymnasium.Wrapper):
-    """A shield between a learner and anyone's environment in which the action is a velocity command.
+    """A shield between a learner and any environment whose action is a velocity command.
 
-    One step of the environment must be one control period of the shield's scenario: over longer holds its
-    rows promise nothing.
+    One step of the environment must be one control period of the shield's scenario. If an action is held
+    longer, the shield guarantees nothing.
 
     **Arguments:**
 
     - `shield` a `sidestep.Shield`, as `make_shield(name, scenario)` gives it
-    - `world_of(env) -> World` reads where everybody is (SI units) from the wrapped environment
-    - `velocity_of(action, world) -> (2,)` m/s in world axes that an action asks for; by default the action
-    - `action_of(velocity, world)` the way back; by default the velocity. An action that the shield leaves as
-      it is goes through untouched.
+    - `world_of(env) -> World` reads the world (SI units) from the wrapped environment
+    - `velocity_of(action, world) -> (2,)` the nominal velocity of an action, m/s in world axes; by default
+      the action itself
+    - `action_of(velocity, world)` its inverse; by default the velocity itself. An action that the shield does
+      not change is passed on as it is.
 
     `info` gains `proposed` and `executed` (actions), `status` (see `sidestep.safety.Status`) and
-    `intervention` (m/s). Learners that store `proposed`, their own action, learn what a correction leads to.
+    `intervention` (m/s). A learner should store `proposed`: the shield is then part of its environment.
 
-    **Raises** `ValueError` for a shield's name, and for a velocity of another shape.
+    **Raises** `ValueError` for a shield's name in place of a `Shield`, and for a velocity of wrong shape.
     """
 
     def __init__(
@@ -76,22 +77,22 @@ class ShieldWrapper(gymnasium.Wrapper):
         if self._memory is None:
             raise gymnasium.error.ResetNeeded("call reset() before the first step")
         world = self._world_of(self.env)
-        wish = np.asarray(self._velocity_of(action, world), np.float32)
-        if wish.shape != (2,):
-            raise ValueError(f"velocity_of must give a velocity of shape (2,), not {wish.shape}")
-        result, self._memory = self._filter(self.shield, world, wish, self._memory)
+        nominal = np.asarray(self._velocity_of(action, world), np.float32)
+        if nominal.shape != (2,):
+            raise ValueError(f"velocity_of must give a velocity of shape (2,), not {nominal.shape}")
+        result, self._memory = self._filter(self.shield, world, nominal, self._memory)
         status, executed = int(result.status), action
         if status != Status.OK:
             like = np.asarray(action)
             executed = np.asarray(self._action_of(np.asarray(result.action), world), like.dtype)
         observation, reward, terminated, truncated, info = self.env.step(executed)
-        told = {
+        added = {
             "proposed": action,
             "executed": executed,
             "status": status,
             "intervention": float(result.intervention),
         }
-        return observation, reward, terminated, truncated, {**info, **told}
+        return observation, reward, terminated, truncated, {**info, **added}
 
 
 @eqx.filter_jit
@@ -100,24 +101,23 @@ def _start_all(shield: Shield, worlds: World) -> Any:
 
 
 @eqx.filter_jit
-def _filter_all(shield: Shield, worlds: World, wishes: Any, memory: Any, fresh: Any) -> Any:
+def _filter_all(shield: Shield, worlds: World, nominal: Any, memory: Any, fresh: Any) -> Any:
     world = in_lanes(worlds)
     memory = select(fresh, start_in_lanes(shield, world), memory)
-    result, memory = filter_in_lanes(shield, world, jnp.moveaxis(wishes, 0, -1), memory)
+    result, memory = filter_in_lanes(shield, world, jnp.moveaxis(nominal, 0, -1), memory)
     return jnp.moveaxis(result.action, -1, 0), result.status, result.intervention, memory
 
 
 @final
 class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
-    """`ShieldWrapper` for vector environments, anyone's too: all worlds are filtered in one compiled call.
+    """`ShieldWrapper` for any vector environment: all worlds are filtered in one compiled call.
 
-    Arguments as there, of all worlds at once: `worlds_of(env) -> World` with their axis in front of every
-    array, `velocities_of(actions, worlds) -> (n, 2)` and `actions_of(velocities, worlds)`. `info` gains the
-    same entries, arrays with a mask each, as Gymnasium's vector environments give them. Rows of actions that
-    the shield leaves as they are go through untouched; what a shield remembers of a world is forgotten when
-    an episode begins there, in each of the three autoreset modes.
+    Arguments as in `ShieldWrapper`, for all worlds at once: `worlds_of(env) -> World` with their axis first,
+    `velocities_of(actions, worlds) -> (n, 2)` and `actions_of(velocities, worlds)`. `info` gains the same
+    entries, as arrays with masks. Actions that the shield does not change are passed on as they are. A
+    world's shield memory is reset when an episode begins, in each of the three autoreset modes.
 
-    **Raises** `ValueError` for a shield's name, and for velocities of another shape.
+    **Raises** `ValueError` for a shield's name in place of a `Shield`, and for velocities of wrong shape.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        # Gymnasium's wrapper says that one seed is all it takes; the environments take a list as well.
+        # Gymnasium's wrapper declares one seed only; the environments accept a list as well.
         inner: Any = self.env
         observation, info = inner.reset(seed=seed, options=options)
         begun = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), bool)
@@ -153,12 +153,12 @@ class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
         if self._memory is None:
             raise gymnasium.error.ResetNeeded("call reset() before the first step")
         worlds = self._worlds_of(self.env)
-        wishes = np.asarray(self._velocities_of(actions, worlds), np.float32)
-        if wishes.shape != (self.num_envs, 2):
+        nominal = np.asarray(self._velocities_of(actions, worlds), np.float32)
+        if nominal.shape != (self.num_envs, 2):
             raise ValueError(
-                f"velocities_of must give velocities of shape ({self.num_envs}, 2), not {wishes.shape}"
+                f"velocities_of must give velocities of shape ({self.num_envs}, 2), not {nominal.shape}"
             )
-        filtered = _filter_all(self.shield, worlds, wishes, self._memory, self._fresh)
+        filtered = _filter_all(self.shield, worlds, nominal, self._memory, self._fresh)
         velocities, status, intervention = (np.asarray(part) for part in filtered[:3])
         self._memory = filtered[3]
         proposed = np.asarray(actions)
@@ -172,25 +172,25 @@ class ShieldVectorWrapper(gymnasium.vector.VectorWrapper):
             AutoresetMode.NEXT_STEP: self._ended,
             AutoresetMode.DISABLED: np.zeros_like(ended),
         }[self._mode]
-        # A step that only begins an episode does nothing with its action.
+        # A step that begins an episode ignores its action.
         acted = ~self._fresh if self._mode is AutoresetMode.NEXT_STEP else np.ones_like(ended)
         self._ended = ended
-        told = {
+        added = {
             "proposed": proposed,
             "executed": executed,
             "status": status,
             "intervention": intervention,
         }
-        told |= {f"_{name}": acted.copy() for name in told}
-        return observation, reward, terminated, truncated, {**info, **told}
+        added |= {f"_{name}": acted.copy() for name in added}
+        return observation, reward, terminated, truncated, {**info, **added}
 
 
 @final
 class SafetyGymnasiumWrapper(gymnasium.Wrapper):
-    """`step` gives six values, with the cost third, as constrained learners want it:
-    `(observation, reward, cost, terminated, truncated, info)`. The cost is `info["cost"]`.
+    """`step` returns six values, as constrained learners expect: `(observation, reward, cost, terminated,
+    truncated, info)`. The cost is `info["cost"]`.
 
-    Gymnasium's own wrappers and checkers expect five values: put them inside this one.
+    Gymnasium's wrappers and checkers expect five values: apply them inside this one.
     """
 
     def step(self, action: Any) -> tuple[Any, Any, float, bool, bool, dict[str, Any]]:  # type: ignore[override]

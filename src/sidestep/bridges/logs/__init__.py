@@ -1,5 +1,4 @@
-"""Logs that robotics people can open: MCAP with ROS 2 messages, from simulation, twin, node and robot
-alike."""
+"""MCAP logs with ROS 2 messages, from simulation, twin, node and robot."""
 
 from sidestep.bridges.logs.episode import Log, load_log, save_log
 from sidestep.bridges.logs.reader import Record, read_log

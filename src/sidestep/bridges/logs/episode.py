@@ -1,4 +1,4 @@
-"""An episode as a log, and a log as an episode."""
+"""Write an episode as a log, and read a log as an episode."""
 
 from __future__ import annotations
 
@@ -29,11 +29,10 @@ _EVENTS = (
 
 @dataclass(frozen=True)
 class Log:
-    """An episode read back.
+    """An episode read from a log.
 
-    - `scenario`, `trajectory`; `about` what the writer said of it
-    - `rebuilt`: what the log did not hold and was worked out from poses, in words; empty for a log of
-      `save_log`
+    - `scenario`, `trajectory`; `about`: the writer's metadata
+    - `rebuilt`: what the log lacked and was reconstructed, in words; empty for a log of `save_log`
     - `complete`: see `Record`
     """
 
@@ -54,16 +53,16 @@ def save_log(
     reactions: Sequence[tuple[float, str]] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Write an episode, of a simulation or of the twin, as an MCAP log; `load_log` gives the same back.
+    """Write an episode of a simulation or of the twin as an MCAP log; `load_log` reads it without loss.
 
-    **Arguments:** `about` what else is to be known (shield, policy, pursuer, seed, source); `levels` per
-    period and `reactions` (time in s, text) of the decision core, if it was one.
+    **Arguments:** `about` metadata (shield, policy, pursuer, seed, source); `levels` per period and
+    `reactions` (time in s, text) of the decision core, if one ran.
 
-    **Raises** as `LogWriter`. Whatever happens, no part of a file is left.
+    **Raises** as `LogWriter`; the file is then not written.
     """
     worlds = _host(trajectory.worlds)
-    # On the host at once: an entry at a time JAX would take a second per thousand.
-    told = jax.tree.map(np.asarray, eqx.tree_at(lambda t: t.worlds, trajectory, None))
+    # Converted at once: JAX takes a millisecond to index an entry.
+    steps = jax.tree.map(np.asarray, eqx.tree_at(lambda t: t.worlds, trajectory, None))
     times = worlds["time"].tolist()
     refuse_existing(path, overwrite)
     with whole_file(path) as beside, LogWriter(beside, scenario, about) as log:
@@ -73,18 +72,18 @@ def save_log(
                 break
             log.decision(
                 stamp,
-                nominal=told.nominal[period],
-                velocity=told.action[period],
-                status=int(told.status[period]),
-                slack=float(told.slack[period]),
-                intervention=float(told.intervention[period]),
-                barriers=told.barriers[period],
+                nominal=steps.nominal[period],
+                velocity=steps.action[period],
+                status=int(steps.status[period]),
+                slack=float(steps.slack[period]),
+                intervention=float(steps.intervention[period]),
+                barriers=steps.barriers[period],
                 level="normal" if levels is None else levels[period],
                 reactions=[text for time, text in reactions if stamp <= time < times[period + 1]],
             )
-            for index, speeds in enumerate(told.wheel_speeds[period]):
+            for index, speeds in enumerate(steps.wheel_speeds[period]):
                 log.wheels(stamp, speeds, index)
-            log.events(stamp, {name: float(getattr(told.events, name)[period]) for name in _EVENTS})
+            log.events(stamp, {name: float(getattr(steps.events, name)[period]) for name in _EVENTS})
     return Path(path)
 
 
@@ -93,7 +92,7 @@ def _host(worlds: World) -> dict[str, np.ndarray]:
 
 
 def _write_world(log: LogWriter, stamp: float, world: Mapping[str, np.ndarray]) -> None:
-    """Poses, and what each robot drove in the period that ends here."""
+    """Poses, and the motion of each robot in the period that ends now."""
     log.pose("evader", stamp, world["evader"], velocity=world["evader_velocity"])
     for index, (pose, wheels) in enumerate(zip(world["pursuers"], world["wheel_speeds"], strict=True)):
         log.pose("pursuer", stamp, pose, index)
@@ -104,19 +103,19 @@ def _write_world(log: LogWriter, stamp: float, world: Mapping[str, np.ndarray]) 
 
 
 def load_log(path: str | Path, scenario: Scenario | None = None) -> Log:
-    """Rebuild an episode from a log of simulation, twin, node or robot.
+    """Reconstruct an episode from a log of simulation, twin, node or robot.
 
-    Control periods begin where a command was sent (`/cmd_vel`); robots are where their last poses had them.
-    What a log does not hold is worked out: velocities from poses, events from distances at these instants.
+    A control period begins at each command (`/cmd_vel`), with each robot at its last logged pose. Missing
+    data is reconstructed: velocities from poses, events from the distances at these times.
 
-    **Arguments:** `scenario` for a log that does not say its own.
+    **Arguments:** `scenario`, if the log does not contain it.
 
-    **Raises** `ValueError` for a file that is no log, or one without poses of the evader or without commands.
+    **Raises** `ValueError` for a file that is not a log, or a log without evader poses or commands.
     """
     record = read_log(path)
     if scenario is None:
         if "scenario" not in record.metadata:
-            raise ValueError(f"{path} does not say its scenario; give one")
+            raise ValueError(f"{path} does not contain its scenario; give one")
         scenario = load_scenario("paper", **json.loads(record.metadata["scenario"]))
     commands = record.topics.get("/cmd_vel", [])
     if not commands or "/evader/pose" not in record.topics:
@@ -134,7 +133,7 @@ def load_log(path: str | Path, scenario: Scenario | None = None) -> Log:
         worlds=worlds_of(worlds),
         nominal=jnp.asarray(nominal),
         action=jnp.asarray(action),
-        wheel_speeds=jnp.asarray(_asked(scenario, record, times[:-1], worlds)),
+        wheel_speeds=jnp.asarray(_commanded_wheels(scenario, record, times[:-1], worlds)),
         events=_events(scenario, record, times, worlds, rebuilt),
         **shield,
     )
@@ -144,11 +143,11 @@ def load_log(path: str | Path, scenario: Scenario | None = None) -> Log:
 
 
 def _instants(scenario: Scenario, record: Record, starts: list[float]) -> list[float]:
-    """When the control periods begin, and when the last one ends: with the last poses."""
+    """Times (s) at which control periods begin; the last period ends with the last pose."""
     last = record.topics["/evader/pose"][-1][0]
     if last <= starts[-1]:
         if len(starts) > 1:
-            # The world after the last command was never seen.
+            # No pose was logged after the last command.
             return starts
         return [*starts, starts[-1] + float(scenario.control_period)]
     return [*starts, last]
@@ -163,7 +162,7 @@ def _vectors(record: Record, topic: str, times: Sequence[float]) -> np.ndarray:
 
 
 def _poses(record: Record, topic: str, times: Sequence[float]) -> np.ndarray:
-    """x, y, heading at these times; before the first pose, that one. NaN for a robot never seen."""
+    """x, y, heading at these times; the first pose before it; NaN for a robot without poses."""
     entries = record.topics.get(topic)
     if not entries:
         return np.full((len(times), 3), np.nan)
@@ -174,7 +173,7 @@ def _poses(record: Record, topic: str, times: Sequence[float]) -> np.ndarray:
 
 
 def _numbers(record: Record, topic: str, times: Sequence[float]) -> list[dict[str, float]]:
-    """Numbers by name at these times; none where there is no message."""
+    """Numbers by name at these times; empty where there is no message."""
     found = [record.at(topic, time) for time in times]
     return [
         {} if one is None else {d.label: value for d, value in zip(one.layout.dim, one.data, strict=True)}
@@ -225,35 +224,35 @@ def _worlds(
 
 def _wheels(record: Record, topic: str, times: Sequence[float]) -> np.ndarray:
     """Wheel speeds (m/s) at these times, NaN where not known."""
-    told = _numbers(record, topic, times)
-    return np.array([(one.get("left", np.nan), one.get("right", np.nan)) for one in told]).reshape(-1, 2)
+    speeds = _numbers(record, topic, times)
+    return np.array([(one.get("left", np.nan), one.get("right", np.nan)) for one in speeds]).reshape(-1, 2)
 
 
-def _asked(
+def _commanded_wheels(
     scenario: Scenario, record: Record, times: list[float], worlds: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """What the pursuers were told; what they drove, where that is not known."""
-    asked = np.stack(
+    """The pursuers' commanded wheel speeds (m/s); the driven ones where those are not known."""
+    commanded = np.stack(
         [_wheels(record, f"/pursuer_{i}/wheel_speeds", times) for i in range(scenario.pursuer_count)], axis=1
     )
     driven = worlds["wheel_speeds"][1:]
-    return np.where(np.isnan(asked), driven, asked).astype(np.float32)
+    return np.where(np.isnan(commanded), driven, commanded).astype(np.float32)
 
 
 def _shield_numbers(
     scenario: Scenario, record: Record, times: list[float], rebuilt: list[str]
 ) -> dict[str, Any]:
-    told = _numbers(record, "/shield", times)
-    if not any(told):
+    messages = _numbers(record, "/shield", times)
+    if not any(messages):
         rebuilt.append("what the shield said: not known")
     count = scenario.pursuer_count + scenario.obstacle_count
 
     def column(name: str, otherwise: float) -> Any:
-        return jnp.asarray([one.get(name, otherwise) for one in told], jnp.float32)
+        return jnp.asarray([one.get(name, otherwise) for one in messages], jnp.float32)
 
-    barriers = [[one.get(f"h{i}", np.nan) for i in range(count)] for one in told]
+    barriers = [[one.get(f"h{i}", np.nan) for i in range(count)] for one in messages]
     return {
-        "status": jnp.asarray([int(one.get("status", Status.INVALID)) for one in told], jnp.int32),
+        "status": jnp.asarray([int(one.get("status", Status.INVALID)) for one in messages], jnp.int32),
         "barriers": jnp.asarray(np.array(barriers, np.float32).reshape(-1, count)),
         "slack": column("slack", np.nan),
         "intervention": column("intervention", 0.0),
@@ -267,9 +266,9 @@ def _events(
     worlds: Mapping[str, np.ndarray],
     rebuilt: list[str],
 ) -> Events:
-    told = _numbers(record, "/events", times[:-1])
-    if told and all(told):
-        columns = {name: np.array([one[name] for one in told]) for name in _EVENTS}
+    messages = _numbers(record, "/events", times[:-1])
+    if messages and all(messages):
+        columns = {name: np.array([one[name] for one in messages]) for name in _EVENTS}
     else:
         rebuilt.append("events: from the distances at the instants of the commands")
         columns = _events_from_poses(scenario, worlds)
@@ -283,7 +282,7 @@ def _events(
 
 
 def _events_from_poses(scenario: Scenario, worlds: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """`Events` of each period, judged at its end."""
+    """`Events` of each period, from the poses at its end."""
     evader, target = worlds["evader"][1:], worlds["target"][1:]
 
     def clearance(places: np.ndarray, contact: Any) -> np.ndarray:

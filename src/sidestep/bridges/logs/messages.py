@@ -1,6 +1,6 @@
-"""The ROS 2 messages that a log is made of, as text that every reader of such logs understands.
+"""The ROS 2 message definitions of a log.
 
-Names and fields are those of ROS 2's own packages; a log carries them, so that a reader needs no ROS.
+Names and fields are those of the ROS 2 packages. A log contains them, so that a reader needs no ROS.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
 
 
 def definition(name: str) -> str:
-    """The text of one of `POSE`, `TWIST`, `DIAGNOSTICS`, `NUMBERS`, with all that it is made of."""
+    """The text of `POSE`, `TWIST`, `DIAGNOSTICS` or `NUMBERS`, with the definitions it depends on."""
     text, parts = _MESSAGES[name]
     return "\n".join([text, *(f"{'=' * 80}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
 
@@ -61,7 +61,7 @@ def definition(name: str) -> str:
 def nanoseconds(stamp: float) -> int:
     """A time in s as whole nanoseconds.
 
-    **Raises** `ValueError` outside of what a log can hold: MCAP counts from 0, ROS up to 2^31 s.
+    **Raises** `ValueError` outside [0, 2^31) s, the range of MCAP and ROS.
     """
     if not 0.0 <= stamp < 2**31:
         raise ValueError(f"stamp = {stamp!r}: a time in a log must be from 0 to 2^31 s")

@@ -1,4 +1,4 @@
-"""Reading a log: whoever wrote it, whole or cut off."""
+"""Read a log of any writer, complete or cut off."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sidestep.bridges.logs.writer import METADATA
 
 @dataclass(frozen=True)
 class Record:
-    """What a log holds.
+    """The content of a log.
 
-    - `topics`: per topic its messages as (time in s, decoded message), in the order of time
-    - `metadata`: what was stored at the beginning, as text by name; empty in a log of someone else's
-    - `complete`: whether the log was closed; one cut off by a crash lacks its last second or so
+    - `topics`: per topic, its messages as (time in s, decoded message), in order of time
+    - `metadata`: text by name, written by `LogWriter`; empty in logs of other software
+    - `complete`: whether the log was closed; one cut off by a crash lacks about its last second
     """
 
     topics: Mapping[str, list[tuple[float, Any]]]
@@ -41,8 +41,7 @@ class Record:
 def read_log(path: str | Path) -> Record:
     """Everything in an MCAP file of ROS 2 messages.
 
-    **Raises** `ValueError` for a file that is none, or without anything in it; or where mcap is not
-    installed.
+    **Raises** `ValueError` for another kind of file, an empty log, or missing mcap.
     """
     needed("mcap_ros2.decoder", "logs", "logs need")
     from mcap.exceptions import McapError
@@ -89,5 +88,5 @@ def read_log(path: str | Path) -> Record:
 
 
 def about_of(record: Record) -> dict[str, Any]:
-    """What the writer of a log said of it: shield, policy, pursuer, seed, source; empty if nothing."""
+    """The writer's `about` (shield, policy, pursuer, seed, source); empty if there is none."""
     return json.loads(record.metadata.get("about", "{}"))

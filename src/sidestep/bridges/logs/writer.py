@@ -1,4 +1,4 @@
-"""Writing a log while something runs: simulation, twin, node or robot."""
+"""Write a log while a simulation, twin, node or robot runs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from sidestep.world import Scenario
 from sidestep.world.loading import scenario_to_dict
 
 METADATA = "sidestep"
-"""Name of the metadata record that says what was logged."""
+"""Name of the metadata record."""
 FRAME = "map"
-"""Frame of all poses and velocities unless told otherwise: the world's axes."""
+"""Default frame of all poses and velocities: world axes."""
 Numbers: TypeAlias = Sequence[float] | AnyArray
 """A few numbers: a list, or an array of NumPy or JAX."""
 _CHUNK = 32_768
@@ -30,17 +30,16 @@ _LEVELS = {Status.OK: 0, Status.CORRECTED: 0, Status.INFEASIBLE: 1, Status.INVAL
 
 
 class LogWriter:
-    """An MCAP file of ROS 2 messages that is being written.
+    """Writes an MCAP file of ROS 2 messages; a context manager.
 
-    A context manager. Times are in s, of any clock that does not run backwards; positions m, velocities m/s,
-    in the axes of `frame`. What is written reaches the disk in chunks of 32 kB, a second or so of a robot's
-    life: a file cut off by a crash lacks no more than the last one, and `load_log` reads the rest.
+    Times are in s, of any clock that does not run backwards; positions in m, velocities in m/s, in the axes
+    of `frame`. Data reaches the disk in chunks of 32 kB, about one second of a robot's messages. A file cut
+    off by a crash lacks at most the last chunk, and `load_log` reads the rest.
 
-    **Arguments:** `scenario` and `about` (what else is to be known: shield, policy, pursuer, seed, source)
-    are stored at the very beginning.
+    **Arguments:** `scenario` and `about` (shield, policy, pursuer, seed, source) are stored as metadata.
 
-    **Raises** `ValueError` where `path` exists and `overwrite` is not set, or mcap is not installed, and
-    `OutputError`, a `ValueError` too, whenever the system refuses to write.
+    **Raises** `ValueError` if `path` exists and `overwrite` is not set, or if mcap is not installed;
+    `OutputError`, a `ValueError` too, when the system refuses to write.
     """
 
     def __init__(
@@ -84,12 +83,12 @@ class LogWriter:
         try:
             self.close()
         except OutputError:
-            # What went wrong first is said.
+            # Report the first error.
             if error[0] is None:
                 raise
 
     def close(self) -> None:
-        """Write the index that lets readers jump, and close the file; once is enough."""
+        """Write the index for random access and close the file. A second call does nothing."""
         if self._file.closed:
             return
         try:
@@ -101,12 +100,12 @@ class LogWriter:
             raise
 
     def _give_up(self) -> None:
-        # Closing tries once more to write what could not be written, and closes all the same.
+        # Closing tries to write once more, and closes the file even if that fails.
         with contextlib.suppress(OSError):
             self._file.close()
 
     def write(self, topic: str, kind: str, stamp: float, message: Mapping[str, Any]) -> None:
-        """Any message of a kind that `messages` has a definition of."""
+        """Write a message of a kind defined in `messages`."""
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_msgdef(kind, messages.definition(kind))
         count = self._counts.get(topic, 0)
@@ -115,7 +114,7 @@ class LogWriter:
             self._writer.write_message(
                 topic, self._schemas[kind], message, log_time=messages.nanoseconds(stamp), sequence=count
             )
-            # A chunk that is complete is the operating system's business, whatever becomes of us.
+            # A complete chunk goes to the operating system, so it survives a crash of this process.
             self._file.flush()
 
     def pose(
@@ -126,8 +125,8 @@ class LogWriter:
         index: int = 0,
         velocity: Numbers | None = None,
     ) -> None:
-        """Where a robot was: `robot` is `"evader"`, `"pursuer"` or `"obstacle"`, `pose` x, y and, if it has
-        one, a heading (rad); `velocity` of an obstacle, if known.
+        """The pose of a robot: `robot` is `"evader"`, `"pursuer"` or `"obstacle"`; `pose` is x, y (m) and
+        optionally a heading (rad); `velocity` (m/s) if known.
 
         Topics `/evader/pose`, `/pursuer_0/pose`, `/obstacle_0/pose`, `/obstacle_0/velocity` and so on.
         """
@@ -138,20 +137,19 @@ class LogWriter:
             self._twist(f"/{name}/velocity", stamp, velocity)
 
     def target(self, stamp: float, target: Numbers) -> None:
-        """Where the evader is to go. Topic `/target`."""
+        """The evader's target (m). Topic `/target`."""
         x, y = _plain(target)
         message = messages.pose(stamp, x, y, 0.0, self._frame)
         self.write("/target", messages.POSE, stamp, message)
 
     def wheels(self, stamp: float, speeds: Numbers, index: int = 0) -> None:
-        """Rim speeds (left, right; m/s) that a pursuer was told. Topic `/pursuer_0/wheel_speeds` and so
-        on."""
+        """A pursuer's commanded rim speeds (left, right; m/s). Topics `/pursuer_0/wheel_speeds` and so on."""
         message = messages.numbers(("left", "right"), _plain(speeds))
         self.write(f"/pursuer_{index}/wheel_speeds", messages.NUMBERS, stamp, message)
 
     def driven(self, stamp: float, speeds: Numbers, index: int = 0) -> None:
-        """Rim speeds (left, right; m/s) that a pursuer drove until now. Topic `/pursuer_0/driven` and so
-        on."""
+        """A pursuer's driven rim speeds (left, right; m/s) of the past period. Topics `/pursuer_0/driven` and
+        so on."""
         self.write(
             f"/pursuer_{index}/driven",
             messages.NUMBERS,
@@ -173,21 +171,25 @@ class LogWriter:
         reactions: Sequence[str] = (),
         **more: float,
     ) -> None:
-        """What the shield was asked and answered; `more` is any other number to keep, such as `latency`.
+        """The nominal action and the shield's answer; `more` holds other numbers, such as `latency`.
 
-        Topics `/cmd_vel_nominal`, `/cmd_vel`, `/diagnostics` and `/shield`, which has the numbers: status,
-        slack, intervention, whatever `more` holds, and the barriers h0, h1, ... (m; pursuers first).
+        Topics `/cmd_vel_nominal`, `/cmd_vel`, `/diagnostics`, and `/shield` with the numbers: status, slack,
+        intervention, those of `more`, and the barriers h0, h1, ... (m; pursuers first).
         """
         self._twist("/cmd_vel_nominal", stamp, nominal)
         self._twist("/cmd_vel", stamp, velocity)
-        told = {"slack": slack, "intervention": intervention, **more}
+        floats = {"slack": slack, "intervention": intervention, **more}
         bars = {f"h{index}": value for index, value in enumerate(_plain(barriers))}
-        values = {"status": float(status), **told, **bars}
+        values = {"status": float(status), **floats, **bars}
         self.write("/shield", messages.NUMBERS, stamp, messages.numbers(list(values), list(values.values())))
         word = Status.NAMES[int(status)]
         severity = max(_LEVELS[int(status)], 0 if level == "normal" else 1)
         message = "; ".join([f"{word}, {level}", *reactions])
-        listed = [("status", word), ("level", level), *((key, f"{value:.6g}") for key, value in told.items())]
+        listed = [
+            ("status", word),
+            ("level", level),
+            *((key, f"{value:.6g}") for key, value in floats.items()),
+        ]
         self.write(
             "/diagnostics",
             messages.DIAGNOSTICS,
@@ -196,12 +198,11 @@ class LogWriter:
         )
 
     def events(self, stamp: float, events: Mapping[str, float]) -> None:
-        """What a simulation says of the period that begins at `stamp`: the fields of `Events`. Topic
-        `/events`."""
+        """The `Events` of the simulated period that begins at `stamp`. Topic `/events`."""
         self.write("/events", messages.NUMBERS, stamp, messages.numbers(list(events), list(events.values())))
 
     def world(self, stamp: float, world: Any) -> None:
-        """All poses, and the target, of a `World`."""
+        """All poses and the target of a `World`."""
         self.pose("evader", stamp, world.evader)
         for index, pose in enumerate(np.asarray(world.pursuers).tolist()):
             self.pose("pursuer", stamp, pose, index)
@@ -210,8 +211,7 @@ class LogWriter:
         self.target(stamp, world.target)
 
     def onboard(self, stamp: float, decision: Any) -> None:
-        """A `Decision` of `sidestep.robot`, with the world that it was made from, if there was
-        one."""
+        """A `Decision` of `sidestep.robot`, with the estimated world it was made from, if any."""
         if decision.world is not None:
             self.world(stamp, decision.world)
         self.decision(
@@ -234,7 +234,7 @@ class LogWriter:
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """**Raises** `ValueError` where there is a file that is not to be written over."""
+    """**Raises** `ValueError` if the file exists and `overwrite` is not set."""
     if Path(path).exists() and not overwrite and not is_stream(path):
         raise ValueError(f"{path} exists already; give the log another name")
 
