@@ -1,1 +1,1 @@
-"""ROS 2 nodes around `sidestep.robot`: they carry messages, and decide nothing themselves."""
+"""ROS 2 nodes around `sidestep.robot`. They only transport messages; the decision core decides."""

@@ -1,4 +1,4 @@
-"""How does a velocity in world axes become a command for the base, and the other way round?"""
+"""Conversion between velocities in world axes and commands of the base."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from sidestep_ros.times import Times
 
 
 class Attitude:
-    """Which way the evader's body points: the last heading seen, turned on as commanded since."""
+    """The evader's heading: the last measured one, extrapolated with the commanded turn rate."""
 
     def __init__(self):
         self._heading = 0.0
@@ -18,18 +18,19 @@ class Attitude:
         self.turn_rate = 0.0
 
     def see(self, stamp: float, heading: float) -> None:
-        """The heading (rad) at time `stamp` (s)."""
+        """Register a measured heading (rad) at time `stamp` (s)."""
         self._heading, self._at = heading, stamp
 
     def at(self, now: float) -> float:
-        """The heading (rad) at time `now` (s), as far as one knows; 0 before the first one is seen."""
+        """The extrapolated heading (rad) at time `now` (s); 0 before the first measurement."""
         return self._heading + self.turn_rate * max(0.0, now - self._at if math.isfinite(self._at) else 0.0)
 
 
 class Commands:
-    """Commands of one type, in the evader's body frame or in world axes.
+    """Reads and writes commands of one type, in the evader's body frame or in world axes.
 
-    In body axes the velocity of a turning base would turn with it: it is given for the middle of the period.
+    A velocity in body axes rotates with a turning base, so it is converted with the heading at the middle of
+    the period.
     """
 
     def __init__(self, values: dict[str, Any], times: Times, attitude: Attitude, period: float):
@@ -41,10 +42,10 @@ class Commands:
         self._turn_rate_limit = values["turn_rate_limit"]
 
     def read(self, message: Any) -> tuple[float, tuple[float, float], float]:
-        """When a command was given (s), its velocity in world axes (m/s), its turn rate (rad/s), limited.
+        """Time (s), velocity in world axes (m/s) and limited turn rate (rad/s) of a command.
 
-        A stamped one may be in the body frame or in the fixed frame, whatever the parameters say of commands
-        without a frame. **Raises** `UnusableMessageError` for any other frame.
+        A stamped command may be in the body frame or in the fixed frame; the parameter `command.axes` is for
+        commands without a frame. **Raises** `UnusableMessageError` for any other frame.
         """
         now = self._times.now()
         when, body = now, self._body
@@ -64,7 +65,7 @@ class Commands:
         return when, velocity, min(max(turn_rate, -limit), limit)
 
     def write(self, stamp: Any, x: float, y: float, turn_rate: float) -> Any:
-        """The message that asks for velocity (x, y) (m/s, world axes) and a turn rate (rad/s) from now on."""
+        """The message that commands velocity (x, y) (m/s, world axes) and a turn rate (rad/s) from now on."""
         if self._body:
             heading = self._attitude.at(self._times.now()) + turn_rate * self._period / 2.0
             x, y = rotate(x, y, -heading)

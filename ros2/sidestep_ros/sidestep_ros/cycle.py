@@ -1,4 +1,4 @@
-"""When is it time to decide, and which commands came late?"""
+"""The times of decisions, and the detection of late commands."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ _SOON = 0.25
 
 @dataclass(frozen=True)
 class Late:
-    """A command that came late: the `gap` (s) since the one before, of which the decision took `took` (s)."""
+    """A late command: `gap` (s) since the previous one, of which the decision took `took` (s)."""
 
     gap: float
     took: float
@@ -19,13 +19,13 @@ class Late:
 
 
 class Cycle:
-    """The control period, kept and watched.
+    """Determines when to decide, and detects late commands.
 
-    A command is wanted every `period` (s). With poses as the trigger one is decided on as soon as all poses
-    are there, once nine tenths of the period are over; without them after `patience`, a share `grace` beyond
-    the period. After that the poses are waited for anew: the next decision follows them at once, unless less
-    than a quarter of the period is over. A command is late if it goes out more than a share `late_after` of
-    the period after it should have.
+    There should be one command per `period` (s). If poses are the trigger, a decision follows as soon as all
+    poses have arrived and 0.9 periods are over. Without poses it follows after `patience`, which is the
+    period plus the share `grace`; the next decision then follows the next poses at once, unless less than a
+    quarter of the period is over. A command is late if it is sent more than the share `late_after` of the
+    period after its due time.
     """
 
     def __init__(self, period: float, *, grace: float = 0.1, late_after: float = 0.2):
@@ -39,15 +39,16 @@ class Cycle:
         self._out_of_step = True
 
     def is_due(self, now: float) -> bool:
-        """Whether poses that are complete at `now` (s) are to be decided on."""
+        """Whether to decide when the poses are complete at `now` (s)."""
         share = _SOON if self._out_of_step else _EARLY
         # A simulated clock may go back.
         return now < self._last or now - self._last >= share * self.period
 
     def sent(self, now: float, took: float, *, in_step: bool) -> Late | None:
-        """To be told of each command as it goes out at `now` (s), after a decision that took `took` (s).
+        """Register a command sent at `now` (s), after a decision that took `took` (s); returns it if it is
+        late.
 
-        `in_step` says that it followed on poses, and not on waiting for them.
+        `in_step`: the decision was triggered by poses, not by the timer.
         """
         gap = now - self._last
         self._last, self._out_of_step = now, not in_step

@@ -1,4 +1,4 @@
-"""Where does a node keep what it decided?"""
+"""The log of a node's decisions."""
 
 import os
 from typing import Any, final
@@ -8,9 +8,9 @@ from sidestep_ros.parameters import ConfigurationError
 
 @final
 class DecisionLog:
-    """Every decision of a node and the world that it was made from, as an MCAP file; nothing without a path.
+    """Writes every decision of a node and its estimated world to an MCAP file; nothing without a path.
 
-    **Raises** `ConfigurationError` where the file exists, cannot be made, or the packages are missing.
+    **Raises** `ConfigurationError` if the file exists or cannot be created, or if packages are missing.
     """
 
     def __init__(self, path: str, scenario: Any, frame: str, about: dict[str, Any]):
@@ -26,9 +26,10 @@ class DecisionLog:
             raise ConfigurationError([f"'log': {error}"]) from error
 
     def add(self, stamp: float, decision: Any) -> str:
-        """Write one down; says what went wrong, after which no more is written: the robot drives on.
+        """Write a decision. Returns the error, after which nothing more is written, so that the robot
+        continues.
 
-        Times in the file go on when those of the decisions (`stamp`, s) go back: a file has none before 0.
+        Times in the file never decrease, even if those of the decisions (`stamp`, s) do.
         """
         if self._writer is None:
             return ""

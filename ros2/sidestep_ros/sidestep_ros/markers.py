@@ -1,4 +1,4 @@
-"""What does RViz show of a decision?"""
+"""RViz markers of a decision."""
 
 import math
 from typing import Any
@@ -34,7 +34,7 @@ def circle(radius: float) -> list[tuple[float, float]]:
 def capture_set(capture_distance: float, speed_ratio: float) -> list[tuple[float, float]]:
     """Outline (m) of K(l) in the pursuer's frame, x ahead: the hull of the disc of radius l and (+-l/rho, 0).
 
-    With a pursuer that is not faster, rho >= 1, it is the disc.
+    For rho >= 1 (the evader is at least as fast) it is the disc.
     """
     if speed_ratio >= 1.0:
         return circle(capture_distance)
@@ -47,7 +47,7 @@ def capture_set(capture_distance: float, speed_ratio: float) -> list[tuple[float
 
 
 class Painter:
-    """Markers of one scenario: outlines are made once, only where they are changes."""
+    """Markers of one scenario. Outlines are computed once; only their poses change."""
 
     def __init__(self, scenario: Any, frame: str, period: float):
         self._frame = frame
@@ -60,7 +60,7 @@ class Painter:
         self._collision = self._points(circle(float(scenario.collision_distance)))
 
     def paint(self, stamp: Any, decision: Any, target: tuple[float, float] | None) -> MarkerArray:
-        """Markers of a decision, and of the `target` if there is one; none if nothing is known yet."""
+        """Markers of a decision, and of the `target` if there is one; none without an estimated world."""
         world = decision.world
         if world is None:
             return MarkerArray()
@@ -122,7 +122,7 @@ class Painter:
             return None
         marker = self._marker(name, 0, Marker.ARROW, stamp)
         marker.scale = Vector3(x=0.015, y=0.04, z=0.05)
-        # As long as the way that the evader would go in two seconds.
+        # The arrow's length is the distance driven in 2 s.
         end = start[0] + _ARROW_SECONDS * vx, start[1] + _ARROW_SECONDS * vy
         marker.points = self._points([start, end])
         return marker

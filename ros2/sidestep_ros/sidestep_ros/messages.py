@@ -1,4 +1,4 @@
-"""What do messages say, in the units of `sidestep`: seconds, poses in the plane, velocities in world axes?"""
+"""Conversion of messages to the units of `sidestep`: s, poses in the plane, velocities in world axes."""
 
 import math
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ _QUATERNION_TOLERANCE = 0.01
 
 
 class UnusableMessageError(ValueError):
-    """A message that cannot be used; its text is the reason that diagnostics give."""
+    """An unusable message; the text is the reason shown in diagnostics."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a robot was: `nanoseconds` of the stamp (0: none was given), x and y (m), heading (rad)."""
+    """A robot's pose: `nanoseconds` of the stamp (0: none given), x and y (m), heading (rad)."""
 
     nanoseconds: int
     x: float
@@ -31,15 +31,15 @@ class Pose:
 
 
 def nanoseconds(stamp: Any) -> int:
-    """A `builtin_interfaces/Time` as one whole number of nanoseconds."""
+    """A `builtin_interfaces/Time` as a whole number of nanoseconds."""
     return stamp.sec * NANOSECONDS + stamp.nanosec
 
 
 def heading_of(quaternion: Quaternion) -> float:
     """Heading (rad) of an orientation: the turn about z.
 
-    **Raises** `UnusableMessageError` unless it is a unit quaternion; one of zeros is what a publisher sends
-    that forgot to fill it in. Numbers that are not finite pass, as a NaN, for the decision core to judge.
+    **Raises** `UnusableMessageError` unless it is a unit quaternion; zeros mean that the publisher did not
+    set it. Non-finite numbers give NaN, which the decision core rejects.
     """
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     length = math.hypot(x, y, z, w)
@@ -58,7 +58,7 @@ def quaternion_of(heading: float) -> Quaternion:
 def read_pose(message: Any, frame: str, *, with_heading: bool = True) -> Pose:
     """The pose in a `PoseStamped` or `Odometry`.
 
-    **Raises** `UnusableMessageError` if it is not in `frame`, or has no usable orientation but needs one.
+    **Raises** `UnusableMessageError` if it is not in `frame`, or lacks a required valid orientation.
     """
     if message.header.frame_id != frame:
         raise UnusableMessageError(f"it is in frame '{message.header.frame_id}', not '{frame}'")
@@ -68,7 +68,7 @@ def read_pose(message: Any, frame: str, *, with_heading: bool = True) -> Pose:
 
 
 def write_pose(kind: str, stamp: Any, frame: str, child: str, x: float, y: float, heading: float) -> Any:
-    """A `PoseStamped` or `Odometry` (by `kind`) in `frame`; `child` is the robot's own frame."""
+    """A `PoseStamped` or `Odometry` (by `kind`) in `frame`; `child` is the robot's body frame."""
     message = POSE_TYPES[kind]()
     message.header.stamp = stamp
     message.header.frame_id = frame
@@ -83,7 +83,7 @@ def write_pose(kind: str, stamp: Any, frame: str, child: str, x: float, y: float
 
 
 def rotate(x: float, y: float, angle: float) -> tuple[float, float]:
-    """The vector (x, y) turned by `angle` (rad), counter-clockwise."""
+    """The vector (x, y) rotated by `angle` (rad), counter-clockwise."""
     cosine, sine = math.cos(angle), math.sin(angle)
     return cosine * x - sine * y, sine * x + cosine * y
 

@@ -1,4 +1,4 @@
-"""What do the nodes that decide have in common: when they decide, and what they say?"""
+"""What the shield node and the policy node share: subscriptions, decisions, diagnostics."""
 
 import abc
 import json
@@ -28,10 +28,10 @@ _REHEARSALS = 3
 
 
 class OnboardNode(Node, abc.ABC):
-    """Poses in, decisions by `sidestep.robot.Onboard`, commands out.
+    """Receives poses, decides with `sidestep.robot.Onboard`, and sends commands.
 
-    A concrete node says in `own_parameters` what it needs besides, makes its decision core in
-    `make_onboard`, and hears what else there is from `listen` on.
+    A concrete node defines its further parameters (`own_parameters`), its decision core (`make_onboard`) and
+    its further subscriptions (`listen`).
     """
 
     own_parameters: tuple[Parameter, ...] = ()
@@ -73,18 +73,18 @@ class OnboardNode(Node, abc.ABC):
 
     @abc.abstractmethod
     def listen(self) -> None:
-        """Subscribe to what this node hears besides poses."""
+        """Subscribe to topics other than poses."""
 
     def velocity_of(self, decision: Any) -> Any:
-        """The velocity (m/s, world axes) of a decision that goes out: the safe one."""
+        """The velocity (m/s, world axes) to send for a decision: the safe one."""
         return decision.velocity
 
     def turn_rate_at(self, now: float) -> float:
-        """The turn rate (rad/s) that is wished at time `now` (s); turning does not matter to the shield."""
+        """The commanded turn rate (rad/s) at time `now` (s); it has no effect on the shield."""
         return 0.0
 
     def get_ready(self) -> None:
-        """Compile, then begin to hear: nothing is compiled once callbacks run."""
+        """Compile, then subscribe, so that nothing is compiled in callbacks."""
         from sidestep.world import scenario_to_dict
 
         self.get_logger().info("compiling; commands follow when that is done")
@@ -101,7 +101,7 @@ class OnboardNode(Node, abc.ABC):
         self.get_logger().info(f"ready after {time.perf_counter() - began:.1f} s")
 
     def _rehearse(self) -> None:
-        """A few decisions on made-up poses, painted too: what runs for the first time is slow."""
+        """Make and paint a few decisions on synthetic poses, because first calls are slow."""
         for count in range(_REHEARSALS):
             now = float(count + 1)
             self.onboard.see("evader", now, (0.0, 0.0, 0.0))
@@ -115,7 +115,7 @@ class OnboardNode(Node, abc.ABC):
         self.onboard.reset()
 
     def leave_safe(self) -> None:
-        """Tell the robot to stop, and give that time to be heard."""
+        """Send a stop, and wait until it is delivered."""
         self._command.publish(self.commands.write(self.get_clock().now().to_msg(), 0.0, 0.0, 0.0))
         self._command.wait_for_all_acked(Duration(seconds=_STOP_SECONDS))
         self._log.close()
@@ -131,14 +131,14 @@ class OnboardNode(Node, abc.ABC):
             self.complaints.add(
                 "clock", f"it went back by {self._decided_at - now:.3f} s: everything begins anew"
             )
-            # The decision core finds out for itself.
+            # The decision core detects this itself.
             self._robots.forget()
             self._report_at = self._paint_at = -math.inf
         self._decided_at = now
         decision = self.onboard.decide(now)
         x, y = map(float, self.velocity_of(decision))
         turn_rate = 0.0 if decision.level == "stop" else self.turn_rate_at(self.times.now())
-        # Of the same instant: whoever records commands can tell from their stamps whether each was in time.
+        # The stamp is the time of sending, so that recorded stamps show whether a command was late.
         stamp, now = self.get_clock().now(), self.times.of_cycle()
         self._command.publish(self.commands.write(stamp.to_msg(), x, y, turn_rate))
         late = self._cycle.sent(now, time.perf_counter() - began, in_step=in_step)
@@ -147,7 +147,7 @@ class OnboardNode(Node, abc.ABC):
             self.world = decision.world
         if late is not None:
             self._lates.append(late)
-        # The command is out; what follows may take its time.
+        # The command is sent; the rest is not time-critical.
         self._report(decision, stamp, now)
         self._paint(decision, stamp, now)
         complaint = self._log.add(self._decided_at, decision)

@@ -1,4 +1,4 @@
-"""The policy node: drives to a target, with a policy and a shield of its own, or with the policy alone."""
+"""The policy node: drives to a target with a policy and a shield, or with the policy alone."""
 
 import math
 import sys
@@ -17,10 +17,10 @@ from sidestep_ros.running import run, tune_jax
 
 @final
 class PolicyNode(OnboardNode):
-    """Goes where the parameter `target` or a message on `target_topic` says, the later of them.
+    """Drives to the target of the parameter `target` or of a message on `target_topic`, whichever is newer.
 
-    A new target is taken if it is finite and not within the collision distance of an obstacle; the one that
-    is taken is published on `~/target`.
+    A new target is accepted if it is finite and not within the collision distance of an obstacle. The
+    accepted target is published on `~/target`.
     """
 
     own_parameters = POLICY
@@ -49,7 +49,7 @@ class PolicyNode(OnboardNode):
     def velocity_of(self, decision: Any) -> Any:
         if not self.values["nominal_only"]:
             return decision.velocity
-        # Unfiltered, but not without knowing where everything is.
+        # Unfiltered, but a stop without an estimated world.
         return (0.0, 0.0) if decision.level in ("evade", "stop") else decision.nominal
 
     def _go_to(self, x: float, y: float) -> None:
@@ -70,7 +70,7 @@ class PolicyNode(OnboardNode):
             self._go_to(pose.x, pose.y)
 
     def _problem(self, target: Any) -> str | None:
-        """Why one should not go there, if there is a reason."""
+        """Why a target is rejected; None if it is accepted."""
         if len(target) != 2 or not all(map(math.isfinite, target)):
             return f"{list(target)} is not two finite numbers, x and y in m"
         if self.world is None:

@@ -1,11 +1,11 @@
-"""Which quality of service does each kind of topic have?
+"""Quality of service per kind of topic.
 
 | topics | reliability | durability | depth | why |
 |---|---|---|---|---|
-| poses in | best effort | volatile | 5 | as sensor data; every publisher matches, late poses are of no use |
+| poses in | best effort | volatile | 5 | as sensor data; matches every publisher, late poses are useless |
 | commands in and out | reliable | volatile | 1 | only the newest counts; matches bases and teleoperation |
 | target in | reliable | volatile | 1 | what RViz's goal button publishes |
-| accepted target, scenario | reliable | transient local | 1 | who comes later still hears the last one |
+| accepted target, scenario | reliable | transient local | 1 | late subscribers get the last one |
 | diagnostics | reliable | volatile | 10 | what `diagnostic_updater` uses |
 | markers | reliable | volatile | 1 | what RViz asks for |
 """
@@ -23,12 +23,12 @@ def _profile(reliable: bool, depth: int, latched: bool = False) -> QoSProfile:
 
 
 POSES_IN = _profile(reliable=False, depth=5)
-# Reliable, so that whoever records poses or asks for reliable ones can be served too.
+# Reliable, to match recorders and subscribers that require it.
 POSES_OUT = _profile(reliable=True, depth=5)
 COMMANDS = _profile(reliable=True, depth=1)
 TARGET = _profile(reliable=True, depth=1)
 LATCHED = _profile(reliable=True, depth=1, latched=True)
 DIAGNOSTICS = _profile(reliable=True, depth=10)
-# Matches what is offered, and loses nothing while the recorder is busy.
+# Matches the offered profiles, and loses nothing while the recorder is busy.
 RECORDED = _profile(reliable=True, depth=200)
 MARKERS = _profile(reliable=True, depth=1)

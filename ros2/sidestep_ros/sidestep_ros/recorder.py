@@ -1,4 +1,4 @@
-"""How long is it from a pose to the command that follows it, and was every late command reported?"""
+"""Measure the latency from poses to commands, and whether every late command was reported."""
 
 import math
 from typing import Any, final
@@ -16,10 +16,10 @@ _ROUNDING = 0.0005
 
 @final
 class Recorder(Node):
-    """Stands where the robot's base would: hears stamped commands, and what diagnostics say of each.
+    """Takes the place of the robot's base: records stamped commands and their diagnostics.
 
-    The node that it listens to needs `command.type: twist_stamped`, and `diagnostics_period: 0.0` for the
-    latency of every command.
+    The recorded node needs `command.type: twist_stamped`, and `diagnostics_period: 0.0` for the latency of
+    every command.
     """
 
     def __init__(self, of: str, command_topic: str = "cmd_vel", **options: Any):
@@ -33,9 +33,9 @@ class Recorder(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._hear_diagnostics, quality.RECORDED)
 
     def forget(self) -> None:
-        """Begin anew: what came before was the start."""
-        for told in (self.arrivals, self.velocities, self.decisions):
-            told.clear()
+        """Discard all records, for example those of the start."""
+        for records in (self.arrivals, self.velocities, self.decisions):
+            records.clear()
 
     def _hear_command(self, message: TwistStamped) -> None:
         stamp = nanoseconds(message.header.stamp)
@@ -50,9 +50,9 @@ class Recorder(Node):
                 self.others[status.name] = status
 
     def latencies(self) -> np.ndarray:
-        """Time (s) from the stamp of the newest pose used to the arrival of each command here."""
+        """Time (s) from the stamp of the newest pose used to the arrival of each command."""
         found = []
-        # A copy: while one counts here, more may arrive in another thread.
+        # A copy, because more may arrive in another thread.
         for stamp, arrival in self.arrivals.copy().items():
             if stamp in self.decisions:
                 age = float(values_of(self.decisions[stamp]).get(reports.NEWEST_POSE, math.nan))
@@ -60,9 +60,9 @@ class Recorder(Node):
         return np.array([latency for latency in found if math.isfinite(latency)])
 
     def gaps(self) -> tuple[np.ndarray, np.ndarray]:
-        """The stamp (ns) of each command but the first, and the time (s) since the one before.
+        """The stamp (ns) of each command except the first, and the time (s) since the previous one.
 
-        Only of commands between the first and the last decision heard of: reports follow their commands.
+        Only for commands between the first and the last reported decision, because reports follow commands.
         """
         decided, arrived = sorted(self.decisions.copy()), sorted(self.arrivals.copy())
         first, last = (decided[0], decided[-1]) if decided else (0, 0)
@@ -70,12 +70,13 @@ class Recorder(Node):
         return stamps[1:], np.diff(stamps) / NANOSECONDS
 
     def summary(self) -> dict[str, Any]:
-        """Latencies (s), late commands by their stamps, and by how many the node's own count falls short."""
+        """Latencies (s), late commands according to their stamps, and how many of them were not reported."""
         latencies, (_, gaps) = self.latencies(), self.gaps()
-        told = [values_of(status) for _, status in sorted(self.decisions.copy().items())]
-        limit = float(told[0][reports.LATE_LIMIT]) if told else math.inf
+        decisions = [values_of(status) for _, status in sorted(self.decisions.copy().items())]
+        limit = float(decisions[0][reports.LATE_LIMIT]) if decisions else math.inf
         late = int(np.sum(gaps > limit + _ROUNDING))
-        reported = int(told[-1][reports.LATE_COMMANDS]) - int(told[0][reports.LATE_COMMANDS]) if told else 0
+        ends = [int(values[reports.LATE_COMMANDS]) for values in (decisions[:1] + decisions[-1:])]
+        reported = ends[-1] - ends[0] if ends else 0
         arrivals = np.diff(np.array(sorted(self.arrivals.copy().values()), np.int64)) / NANOSECONDS
         return {
             "commands": len(self.arrivals),
@@ -88,7 +89,7 @@ class Recorder(Node):
             "late commands not reported": max(0, late - reported),
             "longest time between commands": _quantile(gaps, 1.0),
             "longest time between arrivals": _quantile(arrivals, 1.0),
-            "levels": _count(values["level"] for values in told),
+            "levels": _count(values["level"] for values in decisions),
         }
 
 

@@ -1,4 +1,4 @@
-"""What do diagnostics say about a node?"""
+"""The diagnostics of a node."""
 
 import math
 from collections import Counter
@@ -11,13 +11,13 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 NEWEST_POSE = "newest pose to command (s)"
 LATE_COMMANDS = "late commands"
 LATE_LIMIT = "late if more than (s)"
-"""Values that `recorder` reads again."""
+"""Names of values that `recorder` reads."""
 SEVERITY = {"normal": OK, "degraded": WARN, "evade": ERROR, "stop": ERROR}
-"""How bad each level of a decision is."""
+"""Diagnostic level per level of a decision."""
 
 
 def text(value: object) -> str:
-    """A value as diagnostics show it."""
+    """A value as text for diagnostics."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -35,7 +35,7 @@ def status(name: str, level: bytes, message: str, values: Mapping[str, object]) 
 
 
 class Complaints:
-    """What was wrong with messages, counted since the start and collected since the last report."""
+    """Errors of messages: counts since the start, and those not reported yet."""
 
     def __init__(self):
         self.counts: Counter[str] = Counter()
@@ -43,16 +43,16 @@ class Complaints:
 
     @property
     def fresh(self) -> tuple[str, ...]:
-        """What is not reported yet."""
+        """Errors that are not reported yet."""
         return tuple(self._fresh.values())
 
     def add(self, about: str, why: str) -> None:
-        """Count one more message on `about` that was not used, and why."""
+        """Count an unused message on `about`, with the reason."""
         self.counts[about] += 1
         self._fresh[about] = f"{about}: {why}"
 
     def reported(self) -> None:
-        """What was fresh is reported now."""
+        """Mark all errors as reported."""
         self._fresh.clear()
 
 

@@ -1,4 +1,4 @@
-"""How do the poses of all robots come to the decision core?"""
+"""Subscriptions to the poses of all robots."""
 
 import functools
 from collections.abc import Callable
@@ -16,12 +16,12 @@ _OF_ONE_SWEEP = 0.75
 
 
 class Robots:
-    """Subscriptions to the poses of evader, pursuers and obstacles.
+    """Subscribes to the poses of evader, pursuers and obstacles, and passes them to the decision core.
 
-    What the core accepts is told to `attitude` too, if it is the evader's; what cannot be used, to
-    `complaints`. `on_complete` is called when every robot has been heard of since `begin_anew`, and none of
-    the poses is older than the newest by three quarters of the `period` (s) or more: with one that came a
-    little after the last decision, every set would be complete a pose too early from then on.
+    Accepted headings of the evader also go to `attitude`, and unusable messages to `complaints`.
+    `on_complete` is called when a pose of every robot has arrived since `begin_anew`, and the poses' stamps
+    differ by less than three quarters of the `period` (s). Without that limit, a pose that arrives just after
+    a decision would make every following set complete too early.
     """
 
     def __init__(
@@ -45,18 +45,18 @@ class Robots:
         self._stamps: dict[tuple[str, int], float] = {}
 
     def subscribe(self, onboard: Any) -> None:
-        """From now on tell `onboard` what is heard."""
+        """Subscribe, and pass poses to `onboard` from now on."""
         self._onboard = onboard
         for (kind, index), (topic, message_type) in self._topics.items():
             hear = functools.partial(self._hear, kind, index)
             self._node.create_subscription(message_type, topic, hear, quality.POSES_IN)
 
     def begin_anew(self) -> None:
-        """A decision is made: the poses heard so far are used."""
+        """Begin a new set of poses after a decision."""
         self._heard.clear()
 
     def forget(self) -> None:
-        """Nobody has been heard of."""
+        """Forget all poses."""
         self._heard.clear()
         self._stamps.clear()
 

@@ -1,4 +1,4 @@
-"""How does a node start, run and stop?"""
+"""Start, run and stop a node."""
 
 import gc
 import os
@@ -18,10 +18,11 @@ _LOOK_AROUND = 0.1
 
 
 def tune_jax() -> None:
-    """Settings for single small decisions; the user's environment comes first. Call it before JAX is there.
+    """Set up JAX for single small decisions; environment variables of the user have priority. Call it before
+    JAX is imported.
 
-    One thread: a decision is too small to share, and the other cores have robots to drive. The thread that
-    asks computes: waking another takes longer than most decisions. What was compiled is kept on disk.
+    JAX uses one thread, because one decision is too small to parallelise, and computes in the calling thread,
+    because waking another takes longer than most decisions. Compiled programs are cached on disk.
     """
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     for name, value in thread_limits(1).items():
@@ -35,14 +36,14 @@ def tune_jax() -> None:
 def run(make: Callable[[], Any], arguments: list[str] | None = None) -> int:
     """Run the node that `make` builds until a signal or the middleware ends it; returns the exit status.
 
-    The node has `get_ready()`, in which everything slow happens, and `leave_safe()`. Whatever ends it, an
-    exception included, `leave_safe` is called while the node can still speak.
+    The node has `get_ready()` for all slow work, and `leave_safe()`, which is called at the end, also after
+    an exception, while the node can still publish.
     """
-    # The middleware's own handlers would close all publishers before a stop can be sent.
+    # The middleware's handlers would close all publishers before a stop can be sent.
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     node: Any = None
     try:
-        # While something compiles a signal ends it at once; in the loop, after the callback that runs.
+        # During compilation a signal ends the process at once; in the loop, after the running callback.
         _on_signals(_leave)
         node = make()
         node.get_ready()
@@ -66,17 +67,17 @@ def _on_signals(handler: Callable[..., None]) -> None:
 
 
 def _leave(number: int, _frame: Any) -> None:
-    # No command has been sent that a stop would have to follow, and no exception gets through a compiler.
+    # No command has been sent yet, so no stop is needed, and a compiler does not let exceptions through.
     os._exit(128 + number)
 
 
 def _spin(node: Any) -> None:
     asked: list[int] = []
     _on_signals(lambda number, _frame: asked.append(number))
-    # What is there now stays: with JAX loaded a full collection takes 128 ms, and next to nothing after this.
+    # Exclude all present objects: with JAX loaded a full garbage collection takes 128 ms.
     gc.collect()
     gc.freeze()
-    # rclpy's events executor takes half the time, but ends with an error of its own after some seconds.
+    # rclpy's events executor takes half the time, but fails after some seconds.
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while rclpy.ok() and not asked:

@@ -1,4 +1,4 @@
-"""What do the parameters mean to `sidestep`: which scenario, settings of the decision core, plant?"""
+"""Scenario, settings of the decision core and plant from the parameters."""
 
 import json
 from typing import Any
@@ -10,13 +10,13 @@ _OF_ONBOARD = (
     "predict_pursuer", "obstacle_acceleration", "stale_after", "nominal_timeout", "on_fault",
     "jump_tolerance", "heading_tolerance", "jump_confirmations", "future_tolerance",
 )  # fmt: skip
-"""Parameters that are fields of `OnboardSettings` by the same name."""
+"""Parameters with the names of fields of `OnboardSettings`."""
 
 
 def make_scenario(values: dict[str, Any]) -> Any:
-    """The scenario of the parameters, with one pursuer and one obstacle for each of their topics.
+    """The scenario of the parameters, with one pursuer or obstacle per topic.
 
-    **Raises** `ConfigurationError` if there is no such scenario.
+    **Raises** `ConfigurationError` for an invalid scenario.
     """
     from sidestep.world import ScenarioError, load_scenario
 
@@ -43,9 +43,9 @@ def make_scenario(values: dict[str, Any]) -> Any:
 
 
 def make_plant(values: dict[str, Any], scenario: Any) -> Any:
-    """What moves in the twin, a `sidestep.plants.Plant`: the plain simulation, or bodies in MuJoCo.
+    """The twin's `sidestep.plants.Plant`: the simulation, or bodies in MuJoCo.
 
-    **Raises** `ConfigurationError` for sensors or a base that there are not, and without MuJoCo.
+    **Raises** `ConfigurationError` for unknown sensors or an unknown base, and without MuJoCo.
     """
     if values["physics"] == "plain":
         from sidestep.plants import Simulation
@@ -61,7 +61,7 @@ def make_plant(values: dict[str, Any], scenario: Any) -> Any:
 
 
 def make_onboard_settings(values: dict[str, Any], scenario: Any) -> Any:
-    """`OnboardSettings` from the parameters. **Raises** `ConfigurationError` for those that cannot be."""
+    """`OnboardSettings` from the parameters. **Raises** `ConfigurationError` for invalid ones."""
     from sidestep.robot import OnboardSettings
     from sidestep.safety import Budget
 
@@ -77,7 +77,7 @@ def make_onboard_settings(values: dict[str, Any], scenario: Any) -> Any:
 
 
 def check_topics(values: dict[str, Any]) -> None:
-    """**Raises** `ConfigurationError` unless every robot has a topic of its own."""
+    """**Raises** `ConfigurationError` unless every robot has a separate topic."""
     topics = [values["evader.topic"], *values["pursuers.topics"], *values["obstacles.topics"]]
     problems = [f"topic '{topic}' is given for more than one robot" for topic in _repeated(topics)]
     if not values["evader.topic"]:

@@ -1,4 +1,4 @@
-"""The shield node: filters anyone's `cmd_vel` into a safe one."""
+"""The shield node: filters nominal commands into safe ones."""
 
 import math
 import sys
@@ -13,7 +13,7 @@ from sidestep_ros.running import run, tune_jax
 
 @final
 class ShieldNode(OnboardNode):
-    """Hears a nominal command, and publishes the closest safe one of the same type."""
+    """Subscribes to a nominal command, and publishes the filtered command of the same type."""
 
     own_parameters = SHIELD
 
@@ -44,7 +44,7 @@ class ShieldNode(OnboardNode):
 
     def turn_rate_at(self, now: float) -> float:
         when, turn_rate = self._turning
-        # Of either sign: the clock may have gone back since.
+        # The age may be negative, because the clock may have gone back.
         return turn_rate if abs(now - when) <= self.values["nominal_timeout"] else 0.0
 
 

@@ -1,4 +1,4 @@
-"""What time is it, for poses, for the control cycle, and for what a stamp says?"""
+"""The clocks of poses and of the control cycle."""
 
 import time
 from collections.abc import Callable
@@ -12,10 +12,10 @@ from sidestep_ros.messages import NANOSECONDS, UnusableMessageError
 
 
 class Times:
-    """Times in s since the node began, small enough for full precision.
+    """Times in s since the node's start, which floats represent precisely.
 
-    Poses live in ROS time, which may be simulated and may be set. The cycle must go on when somebody sets the
-    clock: it runs by a steady one, unless time is simulated.
+    Poses have ROS time, which may be simulated and may be set. The control cycle must continue when the clock
+    is set, so it uses a steady clock, unless time is simulated.
     """
 
     def __init__(self, node: Node, stamps: str = "header"):
@@ -26,7 +26,7 @@ class Times:
         self.timer_clock = self._ros if self._simulated else Clock(clock_type=ClockType.STEADY_TIME)
 
     def seconds(self, nanoseconds: int) -> float:
-        """A time of the ROS clock as s since the node began."""
+        """A time of the ROS clock in s since the node's start."""
         return (nanoseconds - self._epoch) / NANOSECONDS
 
     def now(self) -> float:
@@ -34,25 +34,25 @@ class Times:
         return self.seconds(self._ros.now().nanoseconds)
 
     def of_cycle(self) -> float:
-        """The time (s, from anywhere) that the control cycle goes by."""
+        """The time (s, of arbitrary origin) of the control cycle."""
         return self.now() if self._simulated else time.monotonic()
 
     def when_set_back(self, act: Callable[[], None]) -> None:
         """Call `act` whenever a simulated clock goes back.
 
-        A timer on it must be reset then: rcl does so by itself only for a timer that ran out after the time
-        to which the clock goes back, not for one that poses have always reset before.
+        A timer on it must be reset then: rcl does so only for a timer that last ran out after the time to
+        which the clock goes back, not for one that poses have always reset before it ran out.
         """
-        # Kept for as long as the node is there.
+        # Keep a reference for the lifetime of the node.
         self._jumps = self._ros.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False),
             post_callback=lambda jump: act(),
         )
 
     def of_stamp(self, nanoseconds: int) -> float:
-        """The time (s) of which a message with this stamp speaks, as the parameter `stamps` says.
+        """The time (s) of a message with this stamp, according to the parameter `stamps`.
 
-        **Raises** `UnusableMessageError` for a stamp of zero that may not be replaced.
+        **Raises** `UnusableMessageError` for a zero stamp that may not be replaced.
         """
         if self._stamps == "arrival" or (nanoseconds == 0 and self._stamps == "arrival_if_zero"):
             return self.now()

@@ -1,4 +1,4 @@
-"""The twin node: robots to try the other nodes on. It publishes poses and obeys commands, in real time."""
+"""The twin node: simulated robots for the other nodes. Publishes poses and executes commands in real time."""
 
 import itertools
 import math
@@ -24,11 +24,11 @@ _REPORT_SECONDS = 1.0
 
 @final
 class TwinNode(Node):
-    """An evader that obeys `cmd_vel`, pursuers that chase it, obstacles that drift.
+    """An evader that executes `cmd_vel`, pursuers that chase it, and drifting obstacles.
 
-    The world moves on whenever a command comes or poses are due, by exactly the time that has passed: a
-    command counts from the instant at which it arrives. Everything stands still until the first one. Contact
-    is counted, and everything starts anew.
+    The world advances by the elapsed time whenever a command arrives or poses are due, so a command acts from
+    its arrival on. All robots stand still until the first command. Contacts are counted; after a contact a
+    new episode begins.
     """
 
     def __init__(self, **options: Any):
@@ -55,7 +55,7 @@ class TwinNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", quality.DIAGNOSTICS)
 
     def get_ready(self) -> None:
-        """Compile and place everything; then time runs."""
+        """Compile and place all robots, then start the clock."""
         self._begin()
         self.create_subscription(
             COMMAND_TYPES[self._commands.kind], self.values["command.topic"], self._obey, quality.COMMANDS
@@ -67,7 +67,7 @@ class TwinNode(Node):
         self.get_logger().info("ready")
 
     def leave_safe(self) -> None:
-        """Nothing of the twin's goes on moving without it."""
+        """Nothing to do: the simulated robots stop with the node."""
 
     def _make_pursuer(self, name: str) -> Any:
         import equinox as eqx
@@ -139,18 +139,18 @@ class TwinNode(Node):
             publisher.publish(write_pose(kind, when, self.values["frame"], f"{robot}{index}", *pose))
 
     def _move(self) -> None:
-        """Let the world move on to now, the evader as told, or at rest if that was too long ago."""
+        """Advance the world to now. The evader follows its last command, or stops if that is too old."""
         now = self._times.of_cycle()
         passed, self._moved_at = now - self._moved_at, now
         if passed <= 0.0 or not self._counts["commands"]:
             return
         when, velocity, turn_rate = self._command
-        # A simulated clock may have gone back since.
+        # A simulated clock may have gone back.
         if not 0.0 <= now - when <= self.values["command_timeout"]:
             velocity, turn_rate = (0.0, 0.0), 0.0
         self._plant.command(np.asarray(velocity, float), self._wheels, turn_rate)
         self._time += passed
-        # MuJoCo moves on in whole steps: what one stretch leaves over, the next one makes up for.
+        # MuJoCo advances in whole steps; the remainder is added to the next advance.
         self._happened(self._plant.advance(self._time - self._plant.time))
 
     def _happened(self, contacts: Any) -> None:
@@ -172,7 +172,7 @@ class TwinNode(Node):
                 self._set_new_target()
 
     def _set_new_target(self) -> None:
-        """Another target in the arena, not at an obstacle and not where the evader is."""
+        """Choose a new target in the arena, away from obstacles and from the evader."""
         world, half = self._plant.world, float(self.scenario.arena_side) / 2.0
         taken = [*np.asarray(world.obstacles, float)[:, :2], np.asarray(world.evader, float)]
         apart = float(self.scenario.target_separation)
@@ -190,7 +190,7 @@ class TwinNode(Node):
 
     def _report(self) -> None:
         if self.values["new_targets"]:
-            # Again and again: whoever comes later must hear it too, and RViz's own targets are not latched.
+            # Sent repeatedly for late subscribers, because RViz's targets are not latched.
             self._tell_target()
         contact = self._counts["captured"] + self._counts["collided"]
         values = {**self._counts, "least clearance (m)": self._least, **self._complaints.counts}
