@@ -1,4 +1,4 @@
-"""One module per command: its arguments, and `run(command, console)`, which gives the exit status.
+"""One module per command: its options, and `run(command, console)`, which returns the exit status.
 
-Every command imports what it needs when it runs, so that `--help` is immediate.
+A command imports what it needs when it runs, so that `--help` is fast.
 """

@@ -25,20 +25,20 @@ _FAILURES_SHOWN = 5
 
 @dataclass(frozen=True)
 class Campaign:
-    """Run a grid of trainings or evaluations over cores or machines; the same command goes on with it."""
+    """Run a grid of trainings or evaluations on many cores or machines; the same command resumes it."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
-    """Campaign file: what to run, over which seeds, scenarios, shields and pursuers."""
+    """Campaign file: what to run, for which seeds, scenarios, shields and pursuers."""
     out: Path | None = None
-    """Folder for the results, a new one or this campaign's; by default runs/ and the file's name."""
+    """Folder for the results, a new one or this campaign's; by default runs/ plus the file's name."""
     scheduler: Annotated[str, tyro.conf.arg(metavar="local|tcp://HOST:PORT")] = "local"
-    """Workers on this machine, or those of a Dask scheduler that runs already."""
+    """local for workers on this machine, or the address of a running Dask scheduler."""
     workers: int | None = bounded(None, WORKERS)
     """Local workers, one job each at a time; one per core by default."""
     threads_per_worker: int | None = bounded(None, WORKERS)
     """Cores for each local worker's job; an equal share of all by default."""
     dry_run: bool = False
-    """Only check the file and say how many jobs it asks for."""
+    """Only check the file and print its number of jobs."""
     json: Path | None = None
     """Also write counts, failures and comparisons to this file."""
 
@@ -80,7 +80,7 @@ def run(command: Campaign, console: Console) -> int:
 
 
 def _comparisons(plan: Plan, rows: list[dict[str, Any]]) -> tuple[list[Comparison], list[str]]:
-    """What the file asks to compare, as far as there are results, and why the rest is not."""
+    """The comparisons that the file requests, and reasons for those that are not possible."""
     from sidestep.trials.campaign import compare
 
     asked, found, without = plan.compare, [], []
@@ -89,7 +89,7 @@ def _comparisons(plan: Plan, rows: list[dict[str, Any]]) -> tuple[list[Compariso
         try:
             found.append(compare(rows, asked.by, figure, lower_is_better=figure in asked.lower_is_better))
         except ValueError as error:
-            # A time to reach where nobody did, for example.
+            # For example a time to reach the target if no episode reached it.
             without.append(str(error))
     return found, without
 
@@ -109,7 +109,7 @@ def _report(plan: Plan, outcome: CampaignOutcome, comparisons: Sequence[Comparis
 
 
 def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Console) -> None:
-    """What was done, what was not, and how to go on."""
+    """Print the finished and failed jobs, and how to continue."""
     say(
         console,
         f"{outcome.done} of {outcome.jobs} jobs have a result: "
@@ -132,11 +132,11 @@ def _say(command: Campaign, folder: Path, outcome: CampaignOutcome, console: Con
         return
     reason = "Jobs failed" if outcome.stopped is None else outcome.stopped[0].upper() + outcome.stopped[1:]
     again = command_line(*_again(command, folder))
-    say(console, f"{reason}. What is done stays done; go on with: {again}")
+    say(console, f"{reason}. Results are kept; continue with: {again}")
 
 
 def _again(command: Campaign, folder: Path) -> list[object]:
-    """What to type after `sidestep` to do the rest."""
+    """The words after `sidestep` that continue the campaign."""
     words: list[object] = ["campaign", command.file, "--out", folder]
     if command.scheduler != "local":
         words += ["--scheduler", command.scheduler]
@@ -147,7 +147,7 @@ def _again(command: Campaign, folder: Path) -> list[object]:
 
 
 def comparison_tables(comparisons: Sequence[Comparison]) -> list[Any]:
-    """For each figure the groups with their interquartile means, then the pairs."""
+    """Per figure, a table of the groups with their interquartile means, then one of the pairs."""
     from rich.table import Table
 
     tables = []
@@ -158,7 +158,7 @@ def comparison_tables(comparisons: Sequence[Comparison]) -> list[Any]:
         table = Table("group", "runs", "interquartile mean", "95 % interval", title=title)
         for group in comparison.groups:
             estimate, low, high = group.interquartile_mean
-            # One run in a stratum leaves nothing to resample.
+            # With one run per stratum there is nothing to resample.
             interval = f"{low:.4g} to {high:.4g}" if group.fewest > 1 else "-"
             table.add_row(_words(group.labels), str(group.values), f"{estimate:.4g}", interval)
         if comparison.left_out:

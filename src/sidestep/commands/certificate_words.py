@@ -1,4 +1,4 @@
-"""What `sidestep certify` prints: the robots, the verdict, the budget, what would help, and every claim."""
+"""The output of `sidestep certify`: robots, verdict, budget, helpful changes, and all claims."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def print_known_robots(console: Console) -> None:
-    """Every robot of `known_robots.toml`: what the model makes of it, its figures, and where they stand."""
+    """Print every robot of `known_robots.toml`: its numbers in the model, its figures and their sources."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -39,7 +39,7 @@ def print_known_robots(console: Console) -> None:
             how = f": {figure['how']}" if "how" in figure else ""
             console.print(escape(f"  {name} {figure['value']:g} [{numbers}]{how}"), highlight=False)
         console.print(f"  Not known: {escape(robot.unknown)}", highlight=False)
-    console.print("[bold]Sources[/bold], and what of them was read")
+    console.print("[bold]Sources[/bold], and the parts used")
     for number, source in enumerate(sources, 1):
         text = f"[{number}] {source['title']}\n    {source['address']}\n    {source['read']}"
         console.print(escape(text), highlight=False, soft_wrap=True)
@@ -59,7 +59,7 @@ def print_robots(
     overrides: Collection[str],
     console: Console,
 ) -> None:
-    """What robots of the catalogue were taken for, and what --set changed; nothing where none is named."""
+    """Print the numbers of the chosen robots in the model, and what --set changed; nothing without robots."""
     from rich.markup import escape
 
     from sidestep.world import known_robots
@@ -74,8 +74,8 @@ def print_robots(
     if not robots:
         return
     console.print(
-        "On the safe side: what is guaranteed holds for the robots as far as these figures do; where it "
-        "fails, the robots may do better than the model.",
+        "These numbers are conservative: if the figures are right, guarantees hold for the robots; if there "
+        "is no guarantee, the robots may still be better than the model.",
         highlight=False,
     )
     distance = _length(situation.capture_distance)
@@ -97,7 +97,7 @@ def _length(value: float) -> str:
 
 
 def print_certificate(certificate: Certificate, console: Console) -> None:
-    """The verdict first, then what it rests on."""
+    """Print the verdict first, then its reasons."""
     from rich.markup import escape
 
     situation = certificate.situation

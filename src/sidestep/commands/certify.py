@@ -19,22 +19,22 @@ if TYPE_CHECKING:
 RobotName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 
 _MAY_BE_ZERO = {"pursuer_half_axle": "half_axle", "control_period": "control_period"}
-"""Scenario fields that no simulation can have at 0, but a certificate can."""
+"""Scenario fields that may be 0 in a certificate, but not in a simulation."""
 
 
 @dataclass(frozen=True)
 class Certify:
-    """Say what is guaranteed: is capture impossible, from where, how near, and what would change it."""
+    """Print what is guaranteed: whether capture is excluded, from which starts, and what would change it."""
 
     scenario: ScenarioName = "paper"
     """Preset or file."""
     pursuer: RobotName = None
-    """A pursuer that is on sale, see --robots: sets its speed and half axle."""
+    """A pursuer on sale, see --robots: sets its speed and half axle."""
     evader: RobotName = None
-    """An evader that is on sale: sets its speed. With both, capture is contact, the sum of their radii."""
+    """An evader on sale: sets its speed. With both, the capture distance is the sum of their radii."""
     set: Overrides = ()
-    """Scenario fields to change; pursuer_half_axle and control_period may be 0 here. wheel_separation, its
-    double, may be given for pursuer_half_axle."""
+    """Scenario fields to change; pursuer_half_axle and control_period may be 0 here. wheel_separation may
+    replace pursuer_half_axle, and is twice as large."""
     position_error: float = bounded(0.0, DISTANCE)
     """Largest error of a measured position of the pursuer, m."""
     heading_error: float = bounded(0.0, HEADING_ERROR)
@@ -42,20 +42,20 @@ class Certify:
     delay: float = bounded(0.0, DELAY)
     """Age of the measurements, s."""
     own_motion: bool = True
-    """Whether the evader adds its own motion during the delay to what it measured."""
+    """Whether the evader accounts for its own motion during the delay."""
     tracking_error: float = bounded(0.0, TRACKING_ERROR)
-    """How far the velocity that the evader drives may be from its command, m/s."""
+    """Largest error of the evader's velocity with respect to its command, m/s."""
     walls: bool = False
     """The robots are in a bounded arena."""
     start: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
-    """A start to ask about: the evader in the pursuer's frame, m (x ahead, y left)."""
+    """A start to check: the evader in the pursuer's frame, m (x ahead, y left)."""
     target_distance: float | None = bounded(None, DISTANCE)
-    """A target's distance from the evader to ask about, m: is it reached before capture?"""
+    """Check whether a target at this distance from the evader, m, is reached before capture."""
     mine: tuple[Literal["evader", "sensing", "task", "pursuer"], ...] = ("evader", "sensing", "task")
-    """What you can change: comes first among the changes that would help, and is tried in pairs. sensing: the
+    """What you can change: listed first among the helpful changes, and also tried in pairs. sensing: the
     control period, errors and delay; task: the capture distance."""
     shield: bool = True
-    """Also compute what the game shield as shipped keeps."""
+    """Also compute the clearance that the game shield keeps without a budget."""
     strict: bool = False
     """Exit status 1 unless capture is excluded (and, if asked, the start is certified)."""
     json: Path | None = None
@@ -63,7 +63,7 @@ class Certify:
     figure: Path | None = None
     """Also draw the sets in the pursuer's frame: PNG, and PDF beside it."""
     robots: bool = False
-    """Only list the robots that --pursuer and --evader know, with their figures and where these stand."""
+    """Only list the robots for --pursuer and --evader, with their figures and sources."""
 
 
 def run(command: Certify, console: Console) -> int:
@@ -77,7 +77,7 @@ def run(command: Certify, console: Console) -> int:
     from sidestep.store.outputs import try_outputs
     from sidestep.world import load_scenario, robot_fields
 
-    # A drawing comes after all else; whether it can be kept is asked before.
+    # The figure is drawn last; check first whether it can be written.
     try_outputs(files=[command.json, *_figure_files(command)])
     overrides = scenario_overrides(command.set, zero=True)
     given = {

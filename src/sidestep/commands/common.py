@@ -29,17 +29,17 @@ T = TypeVar("T")
 
 
 class _NotGiven:
-    """Marks a default: the value counts like any other, but was not asked for."""
+    """Marks the default of an option, to distinguish it from a given value."""
 
 
 def unless_given(value: T) -> T:
-    """`value` as the default of an option, told apart from the same value given; see `given`."""
+    """`value` as a default that `given` can distinguish from the same value on the command line."""
     kind: Any = type("Default", (_NotGiven, type(value)), {})
     return cast(T, kind(value))
 
 
 def given(command: Any, *names: str) -> dict[str, Any]:
-    """Of the options of these names those that were given, as plain values."""
+    """Those of these options that are on the command line, as plain values."""
     values = {name: getattr(command, name) for name in names}
     return {
         name: value
@@ -49,15 +49,15 @@ def given(command: Any, *names: str) -> dict[str, Any]:
 
 
 def settings_from(command: Any, *names: str, stored: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The options of these names: what the command says, or for a run that is resumed what its folder says
-    (`stored`) unless an option was given."""
+    """The values of these options. For a resumed run they are those of its folder (`stored`), unless given on
+    the command line."""
     if stored is None:
         return {name: getattr(command, name) for name in names}
     return {**stored, **given(command, *names)}
 
 
 def scenario_from(command: Any, stored: Scenario | None = None) -> Scenario:
-    """The scenario of `--scenario` (if there is such an option) and `--set`, on top of a resumed run's."""
+    """The scenario of `--scenario` (if there is such an option) and `--set`, based on a resumed run's."""
     from sidestep.world import load_scenario, scenario_to_dict
 
     changes = scenario_overrides(command.set)
@@ -68,7 +68,7 @@ def scenario_from(command: Any, stored: Scenario | None = None) -> Scenario:
 
 
 def options_from(command: Any, stored: TrainingOptions | None = None) -> TrainingOptions:
-    """The training options of `--learner`, on top of a resumed run's."""
+    """The training options of `--learner`, based on a resumed run's."""
     from sidestep.learning import make_options, options_to_dict
 
     return make_options(
@@ -77,17 +77,17 @@ def options_from(command: Any, stored: TrainingOptions | None = None) -> Trainin
 
 
 def resume_words(name: str, folder: Path, json: Path | None) -> list[object]:
-    """What to type after `sidestep` to go on with the run in a folder."""
+    """The words after `sidestep` that resume the run in a folder."""
     return [name, "--out", folder, "--resume", *([] if json is None else ["--json", json])]
 
 
 def say(console: Console, text: str) -> None:
-    """Print a line as it is: neither wrapped, so that commands in it can be pasted, nor coloured."""
+    """Print a line without wrapping, so that commands in it can be pasted, and without colours."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
-    """`("a=1", "b=[0, 1]", "c=text")` as values: JSON where it is JSON, else text.
+    """The values of `("a=1", "b=[0, 1]", "c=text")`: JSON if valid, else text.
 
     **Raises** `ValueError` for an argument without `=`.
     """
@@ -104,8 +104,8 @@ def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
 
 
 def scenario_overrides(pairs: tuple[str, ...], *, zero: bool = False) -> dict[str, Any]:
-    """`parse_overrides` of scenario fields, aliases resolved (see `without_aliases`), so that they may be
-    merged with fields that are stored."""
+    """`parse_overrides` of scenario fields with aliases resolved (see `without_aliases`), so that they can be
+    merged with stored fields."""
     from sidestep.world import without_aliases
 
     return without_aliases(parse_overrides(pairs), zero=zero)
@@ -127,8 +127,8 @@ def policy_and_scenario(
 def scenario_of_run(
     run: str | None, scenario: str | None, overrides: tuple[str, ...]
 ) -> tuple[Scenario, dict[str, Any]]:
-    """The scenario to use a policy in, and what its folder says of the training: `scenario` if one is named,
-    else the folder's own, else paper."""
+    """The scenario for a policy (`scenario` if given, else that of the run folder, else paper), and the
+    configuration in the run folder."""
     from sidestep.store.runs import open_run
     from sidestep.world import load_scenario
 
@@ -141,8 +141,7 @@ def scenario_of_run(
 
 @contextmanager
 def going_on(console: Console, folder: Path, *words: object) -> Iterator[None]:
-    """Says how to do the rest (`words` after `sidestep`) when Ctrl-C, or a disk that takes no more, ends what
-    is inside."""
+    """Print how to continue (`words` after `sidestep`) when Ctrl-C or a full disk ends the work inside."""
 
     def farewell() -> str:
         if not _begun(folder):
@@ -158,8 +157,8 @@ def going_on(console: Console, folder: Path, *words: object) -> Iterator[None]:
         except OutputError as error:
             if not _begun(folder):
                 raise
-            first = "With more room there" if error.full else "When that is mended"
-            raise error.and_kept(f"{first}, go on with: {command_line(*words)}") from error.__cause__
+            first = "With more room there" if error.full else "When that is fixed"
+            raise error.and_kept(f"{first}, continue with: {command_line(*words)}") from error.__cause__
 
 
 def _begun(folder: Path) -> bool:
@@ -167,16 +166,16 @@ def _begun(folder: Path) -> bool:
 
 
 def stood_still(periods: int, episodes: int | None = None) -> str:
-    """What to say where a pursuer's wheel speeds were not finite, in so many control periods."""
+    """The warning that a pursuer's wheel speeds were not finite in this many control periods."""
     where = "" if episodes is None else f" of {episodes} episodes"
     return (
         f"the pursuer's wheel speeds were not finite in {periods} control periods{where}, and it stood "
-        "still: what was not captured then is not safe for that"
+        "still: episodes without a capture then prove nothing"
     )
 
 
 def write_json_file(path: Path | None, data: Any) -> None:
-    """Write `data` to `path`, if there is one; folders on the way to it are made."""
+    """Write `data` to `path` if that is not None; missing folders are created."""
     if path is not None:
         from sidestep.store.files import write_json
 
@@ -184,9 +183,10 @@ def write_json_file(path: Path | None, data: Any) -> None:
 
 
 class _Bar(abc.ABC):
-    """A progress bar on the error stream, so that results alone go to standard output.
+    """A progress bar on the error stream, so that only results go to standard output.
 
-    A context manager that gives its `update`. The bar itself is drawn from `bar_from_width` columns on.
+    A context manager that returns `update`. The bar is drawn only in terminals of `bar_from_width` columns or
+    more.
     """
 
     bar_from_width: ClassVar[int] = 80
@@ -197,7 +197,7 @@ class _Bar(abc.ABC):
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
         screen = RichConsole(stderr=True)
-        # In a narrow terminal the words need the room of the bar.
+        # In a narrow terminal the text needs the room of the bar.
         bar = [BarColumn(bar_width=24)] if screen.width >= self.bar_from_width else []
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -215,7 +215,7 @@ class _Bar(abc.ABC):
 
     @abc.abstractmethod
     def update(self, *values: Any) -> None:
-        """Show where the work is."""
+        """Show the progress."""
 
     def __exit__(self, *error: Any) -> None:
         self._progress.__exit__(*error)
@@ -235,7 +235,7 @@ class TrainingBar(_Bar):
 
 
 class CountBar(_Bar):
-    """Finished of all."""
+    """Number finished of all."""
 
     def update(self, *values: Any) -> None:
         finished, total = values
@@ -243,7 +243,7 @@ class CountBar(_Bar):
 
 
 class CampaignBar(_Bar):
-    """Finished of all, and how the workers are."""
+    """Number finished of all, and a note on the workers."""
 
     first_note = "starting workers"
 

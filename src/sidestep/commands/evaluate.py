@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a policy under a shield against a pursuer over random episodes, with 95 % bounds."""
+    """Measure a policy with a shield against a pursuer over random episodes, with 95 % bounds."""
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
     """Run folder whose policy to evaluate, or goal-seeking for the untrained one."""
@@ -41,12 +41,11 @@ class Evaluate:
     json: Path | None = None
     """Also write the figures to this file."""
     log: Path | None = None
-    """Also write one episode as an MCAP log of ROS 2 messages; never over a file that exists."""
+    """Also write one episode as an MCAP log of ROS 2 messages; never overwrites a file."""
     log_episode: int = bounded(0, least=0)
-    """Which episode --log is to hold: the number of one of those measured."""
+    """The number of the episode for --log."""
     video_episode: Annotated[str, tyro.conf.arg(metavar="NUMBER|worst")] = "0"
-    """Which episode --video is to show: the number of one of those measured, or the one that came closest
-    to capture or collision."""
+    """The episode for --video: its number, or worst for the one with the least clearance."""
     film: VideoOptions = NO_VIDEO
 
 
@@ -80,8 +79,8 @@ def run(command: Evaluate, console: Console) -> int:
     about = {"policy": command.run, "shield": shield, "pursuer": pursuer, "scenario": scenario.name}
     write_json_file(command.json, {**evaluation.to_dict(), **about, "seed": command.seed})
     if command.log is not None:
-        told = {**about, "seed": command.seed, "episode": command.log_episode, "source": "simulation"}
-        _write_log(command, scenario, policy, told, console)
+        about = {**about, "seed": command.seed, "episode": command.log_episode, "source": "simulation"}
+        _write_log(command, scenario, policy, about, console)
     if command.film.video is not None:
         number = _chosen(command.video_episode, evaluation)
         trajectory = rollout(scenario, policy, shield, pursuer, episode_key(command.seed, number))
@@ -94,7 +93,7 @@ def _is_number(text: str, episodes: int) -> bool:
 
 
 def _chosen(episode: str, evaluation: Evaluation) -> int:
-    """The number of an episode; of the least clearance to anybody for `worst`."""
+    """The number of an episode; for `worst` that of the least clearance."""
     if episode != "worst":
         return int(episode)
     import numpy as np
@@ -105,7 +104,7 @@ def _chosen(episode: str, evaluation: Evaluation) -> int:
 def _write_log(
     command: Evaluate, scenario: Any, policy: Any, about: dict[str, Any], console: Console
 ) -> None:
-    """One of the episodes measured, run again and logged."""
+    """Replay one of the measured episodes and log it."""
     from sidestep.bridges.logs import save_log
     from sidestep.loop import episode_key, rollout
 

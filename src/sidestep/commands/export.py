@@ -17,16 +17,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a trained policy, the filter, or both as one file for a small computer: ONNX or jax.export."""
+    """Export a trained policy, the filter, or both as one file for a small computer: ONNX or jax.export."""
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Run folder, or a policy.npz, whose policy to export."""
     out: Path
     """File to write; never overwritten silently."""
     format: str = "onnx"
-    """onnx, for onnxruntime alone, its filter that of the shield game; or jax: any shield, for jax alone."""
+    """onnx: runs with onnxruntime only, with the filter of the shield game; jax: runs with jax, any
+    shield."""
     what: str = "policy+filter"
-    """policy+filter as one program, policy (observation to action) or filter (wished to safe velocity)."""
+    """policy+filter as one program, policy (observation to action) or filter (nominal to safe velocity)."""
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Shield: game for onnx (the look-ahead of joint does not fit a graph); for jax the run's own by
     default."""
@@ -39,13 +40,13 @@ class Export:
     heading_error: float = bounded(0.0, HEADING_ERROR)
     """Budget: largest error of a measured heading of a pursuer, rad."""
     delay: float = bounded(0.0, DELAY)
-    """Budget: time from a pose to the command decided on it, s; the own motion is taken to be predicted."""
+    """Budget: time from a pose to the command based on it, s; the evader's own motion counts as predicted."""
     tracking_error: float = bounded(0.0, TRACKING_ERROR)
-    """Budget: how far the velocity driven is from the velocity told, m/s."""
+    """Budget: largest error of the driven velocity with respect to the commanded velocity, m/s."""
     overwrite: bool = False
     """Replace --out where it exists."""
     json: Path | None = None
-    """Also write what the file says about itself to this file."""
+    """Also write the metadata to this file."""
 
 
 def run(command: Export, console: Console) -> int:

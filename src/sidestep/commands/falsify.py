@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Falsify:
-    """Search for a pursuer, and a start, that break a shield; keep what is found, ready to play again."""
+    """Search for a pursuer and a start that break a shield; keep counterexamples for replay."""
 
     shield: ShieldName = unless_given("joint")
     """Shield to attack."""
@@ -52,23 +52,22 @@ class Falsify:
     attacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
     """Attacks: pursuers, bang-bang, herder, sideswipe, cross-entropy, edge, learned; all by default."""
     minutes: float | None = bounded(None, DURATION)
-    """Time to search for; 3 unless --episodes is given. With --resume on top of the time so far; what is left
-    of it if neither is given."""
+    """Duration of the search; 3 unless --episodes is given. With --resume in addition to the time so far; the
+    rest of the stored time if neither is given."""
     episodes: int | None = bounded(None, EPISODES)
     """Episodes after which each attack ends; with --resume the new total."""
     seconds: float = bounded(unless_given(60.0), DURATION)
-    """Longest episode, in seconds of its own time."""
+    """Longest episode, in simulated seconds."""
     batch: int = bounded(unless_given(256), SIDE_BY_SIDE)
-    """Episodes or plans tried at once; fewer make rounds shorter under a shield that is slow."""
+    """Episodes or plans at once; fewer make rounds shorter with a slow shield."""
     most: int = bounded(unless_given(5), least=1)
     """Counterexamples to keep per attack and outcome (more if they go deeper, or break no assumption)."""
     seed: int = bounded(unless_given(0), SEED)
     """Seed of everything random."""
     resume: bool = False
-    """Go on with the search in --out, with the settings it was begun with. Other options beside it must agree
-    with those."""
+    """Resume the search in --out with its stored settings. Other options must agree with those."""
     replay: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Play this counterexample again, check that it ends the same, and draw it. Searches for nothing."""
+    """Replay this counterexample, check that it ends the same, and draw it. No search."""
     json: Path | None = None
     """Also write the figures to this file."""
     film: VideoOptions = NO_VIDEO
@@ -96,7 +95,7 @@ def run(command: Falsify, console: Console) -> int:
             raise KeyboardInterrupt
     if found.had_ended:
         longer = command_line("falsify", "--out", out, "--resume", "--minutes", 3)
-        say(console, f"{out} had been searched for as long as was asked. To search on: {longer}")
+        say(console, f"{out}: the search had already used its time or episodes. To search longer: {longer}")
     if found.counterexamples:
         first = command_line("falsify", "--replay", found.counterexamples[0])
         say(console, f"{len(found.counterexamples)} in {out}; next: {first}")
@@ -104,7 +103,7 @@ def run(command: Falsify, console: Console) -> int:
 
 
 def _search(command: Falsify, out: Path, console: Console) -> Falsification:
-    """The search, its table and its figures."""
+    """Run the search, print its table and draw its figures."""
     from sidestep.trials.falsification import (
         ATTACKS,
         Plan,
@@ -177,7 +176,7 @@ class SearchBar:
         return self.update
 
     def update(self, progress: Progress) -> None:
-        """Show where the search is."""
+        """Show the progress."""
         tally = progress.tally
         speed = tally.control_periods / max(tally.seconds, 1e-9)
         least = min(each.pursuer_clearance for each in progress.tallies.values())
@@ -203,7 +202,7 @@ def _millimetres(metres: float | None) -> str:
 
 
 def attack_table(found: Falsification) -> Any:
-    """What each attack came to."""
+    """The results of each attack."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -228,7 +227,7 @@ def attack_table(found: Falsification) -> Any:
 
 
 def findings(found: Falsification) -> list[str]:
-    """What was found, by the assumption that was broken."""
+    """The counterexamples by broken assumption, in words."""
     from sidestep.trials.falsification import ASSUMPTIONS
 
     summary = found.summary
@@ -247,7 +246,7 @@ def findings(found: Falsification) -> list[str]:
 
 
 def _draw_all(found: Falsification, console: Console) -> None:
-    """Figures of the counterexamples that have none yet."""
+    """Draw the counterexamples that have no figure yet."""
     from sidestep.trials.falsification import read_counterexample, replay
 
     missing = [
@@ -266,7 +265,7 @@ def _draw_all(found: Falsification, console: Console) -> None:
 
 
 def draw(counterexample: Any, played: Any, path: Path) -> Path:
-    """The figure of a counterexample that was played again; its PNG."""
+    """Draw a replayed counterexample; returns the PNG."""
     from sidestep.trials.falsification import ASSUMPTIONS
     from sidestep.views.counterexample_figure import counterexample_figure
 
@@ -288,10 +287,10 @@ def _replay(command: Falsify, console: Console) -> int:
     policy = None if command.policy == "goal-seeking" else command.policy
     played = replay(counterexample, policy=policy)
     trajectory = played.trajectory
-    told = f"{about['outcome'].replace('_', ' ')} after {about['time']:.2f} s"
+    outcome = f"{about['outcome'].replace('_', ' ')} after {about['time']:.2f} s"
     console.print(
         f"Shield {about['shield']}, policy {about['policy']['name']}, found by {about['attack']} "
-        f"(seed {about['seed']}): {told}",
+        f"(seed {about['seed']}): {outcome}",
         highlight=False,
     )
     if played.exact:

@@ -19,17 +19,17 @@ _NEAR = 2.0
 
 @dataclass(frozen=True)
 class Fly(PhysicsCommand):
-    """Fly a policy on a quadrotor in a physics simulator, hunted by an aircraft: rotors, noise and delay."""
+    """Fly a policy on a quadrotor in a physics simulator, pursued by an aircraft."""
 
     scenario: ScenarioName = "quadrotor-test"
-    """Preset (quadrotor, quadrotor-test) or a file with a quadrotor in it; sidestep train --scenario
-    quadrotor makes a run for it."""
+    """Preset (quadrotor, quadrotor-test) or a file with a quadrotor; sidestep train --scenario quadrotor
+    trains a policy for it."""
     pursuer: PursuerName = "chauffeur"
     """Pursuer strategy."""
     speed: float = bounded(1.0, SPEED_UP)
-    """How many times faster the video runs."""
+    """Speed of the video as a factor on real time."""
     tracking_error: float = bounded(0.04, DISTANCE)
-    """How far the quadrotor may be from the motion asked of it, m: the shield allows for it."""
+    """Bound of the quadrotor's distance from its reference motion, m; part of the shield's budget."""
     wind: tuple[float, float] = bounded((0.0, 0.0), WIND)
     """Wind along x and y, m/s."""
 
@@ -83,7 +83,7 @@ def _plan(command: Fly, console: Console, policy: Any, scenario: Any) -> Plan:
 
 
 def flight_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
-    """As `outcome_counts`, with how many flights kept within the certificate's assumptions, and how many of
+    """`outcome_counts`, with the number of flights within the certificate's assumptions, and how many of
     those were lost."""
     inside = [figure for figure in figures if figure["within_assumptions"]]
     return outcome_counts(figures) | {
@@ -107,7 +107,7 @@ def _say(counts: dict[str, Any], certificate: Any, console: Console) -> None:
     else:
         console.print(f"Nothing is guaranteed: {certificate.reason}.", highlight=False)
     console.print(
-        f"At most {1e3 * counts['tracking_error_max']:.1f} mm from the motion asked for; "
+        f"Largest distance from the reference motion: {1e3 * counts['tracking_error_max']:.1f} mm; "
         f"{counts['infeasible_periods']} periods in which not every row could be kept.",
         highlight=False,
     )

@@ -1,4 +1,4 @@
-"""What `sidestep twin` and `sidestep fly` share: options, and the way from a policy to figures and files."""
+"""What `sidestep twin` and `sidestep fly` share: options, episodes, figures and files."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ class PhysicsCommand:
     noise: Overrides = ()
     """Fields of the sensors to change, such as position_noise=0.005 delay=0.05."""
     pursuer_sees: Literal["truth", "measurements"] = "truth"
-    """What the pursuer decides from."""
+    """What the pursuer decides from: the true world, or the evader's measurements."""
     seeds: int = bounded(1, EPISODES)
     """Episodes, with the seeds from --seed on."""
     seed: int = bounded(0, SEED)
     """First seed, of starts and measurements."""
     steps: int | None = bounded(None, least=1, whole=True)
-    """At most this many control periods; the scenario's episode_steps by default."""
+    """Largest number of control periods; the scenario's episode_steps by default."""
     out: Path | None = None
-    """Folder for the figure of the first episode beside the plain simulation, and its recording."""
+    """Folder for a figure that compares the first episode with the simulation, and for its recording."""
     video: Path | None = None
     """Also render the first episode into this .mp4, .gif or .webp file."""
     speed: float = bounded(2.0, SPEED_UP)
-    """How many times faster the video runs."""
+    """Speed of the video as a factor on real time."""
     rate: int = bounded(25, least=1, most=120)
     """Pictures per second of the video."""
     width: int = bounded(960, least=64, most=1920, unit="pixels")
@@ -69,13 +69,13 @@ class PhysicsCommand:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a command does its own way.
+    """What is specific to a command.
 
-    - `prepare()` makes the player that decides for the robot, `play(player, seed)` an episode
-    - `robots` that move, with their `options`; `report` what else the report says of them
-    - `episodes`, what they are called in words, and `key`, in the report
-    - `stem` and `looks` of the figure, whose simulation runs behind `shield_of(player)`
-    - `counts` of the episodes' figures, and what to `say` of them
+    - `prepare()` returns the player that decides for the robot, `play(player, seed)` plays an episode
+    - `robots` that move, with their `options`; `report`, further entries of the report
+    - `episodes`, the word for them in messages, and `key`, in the report
+    - `stem` and `looks` of the figure, whose simulation uses `shield_of(player)`
+    - `counts` summarises the episodes' figures, `say` prints the summary
     """
 
     prepare: Callable[[], Any]
@@ -95,9 +95,9 @@ class Plan:
 def run_on_plant(
     command: PhysicsCommand, source: str, plan_of: Callable[[Any, Any], Plan], console: Console
 ) -> int:
-    """Do as `plan_of(policy, scenario)` plans; returns the exit status. `source` is said in recordings.
+    """Run the plan of `plan_of(policy, scenario)`; returns the exit status. `source` is stored in recordings.
 
-    While this lasts, the folder that the command writes is held; its amounts are checked before.
+    Amounts are checked first; the output folder is locked during the run.
     """
     from sidestep.store.lock import hold
 
@@ -145,7 +145,7 @@ def run_on_plant(
 
 
 def check_amounts(command: PhysicsCommand) -> None:
-    """**Raises** `ValueError` for a number of seeds, or an output, that there cannot be."""
+    """**Raises** `ValueError` for an invalid number of seeds or an invalid output."""
     from sidestep._arrays import whole_number
 
     whole_number("seeds", command.seeds, most=2**32 - command.seed)
@@ -165,10 +165,11 @@ def check_amounts(command: PhysicsCommand) -> None:
 def play_seeds(
     command: PhysicsCommand, plan: Plan, console: Console
 ) -> tuple[Any, Any, list[dict[str, Any]], bool]:
-    """Play all the command's seeds: the player, the first episode, the figures of all, and whether it was
-    interrupted before the last.
+    """Play all seeds. Returns the player, the first episode, the figures of all, and whether it was
+    interrupted.
 
-    Says once what its shield's budget is warned of. After Ctrl-C what was played counts, if anything was.
+    Prints the warnings of the shield's budget once. After Ctrl-C the episodes played so far are returned, if
+    there are any.
     """
     import warnings
 
@@ -199,7 +200,7 @@ def play_seeds(
 
 
 def setting(command: PhysicsCommand, scenario: Any, options: Any) -> dict[str, Any]:
-    """What was run, for the report."""
+    """The settings, for the report."""
     import importlib.metadata
     from dataclasses import asdict
 
@@ -216,7 +217,8 @@ def setting(command: PhysicsCommand, scenario: Any, options: Any) -> dict[str, A
 
 
 def outcome_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
-    """Counts over episodes with 95 % bounds of the shares, and the least distances (m); None without one."""
+    """Counts of outcomes with 95 % bounds of the shares, and the least distances (m); None without a
+    robot."""
     from sidestep.store.runs import OUTCOMES
     from sidestep.trials import wilson_interval
 
@@ -231,7 +233,7 @@ def outcome_counts(figures: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def episode_table(figures: list[dict[str, Any]], counts: dict[str, Any], what: str, console: Console) -> None:
-    """A line for every episode, and the counts of all with 95 % bounds."""
+    """Print a line per episode, and the counts with 95 % bounds."""
     from rich.table import Table
 
     for figure in figures:

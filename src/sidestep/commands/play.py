@@ -19,28 +19,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Play:
-    """Serve a page in which you drive the pursuer and try to catch the shielded robot."""
+    """Serve a page in which you drive the pursuer and try to capture the shielded robot."""
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
     """Run folder whose policy drives the robot, or goal-seeking for the untrained one."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     shield: ShieldName = "joint"
-    """Shield at first: none, paper, game or joint."""
+    """Initial shield: none, paper, game or joint."""
     pursuer: PursuerName = "you"
-    """Pursuer at first: you, or a strategy such as nash."""
+    """Initial pursuer: you, or a strategy such as nash."""
     set: Overrides = ()
     """Scenario fields to change, such as obstacle_count=2."""
     seed: int = bounded(0, SEED)
     """Seed of the first visitor's starts and targets."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 lets everybody in who can reach this machine."""
+    """Address to listen on; 0.0.0.0 allows access from other machines."""
     port: int = bounded(8765, least=0, most=65535)
-    """Port to listen on; 0 takes a free one."""
+    """Port to listen on; 0 selects a free one."""
     allow_host: tuple[str, ...] = ()
-    """Names under which others reach this machine, beside its addresses."""
+    """Host names under which others reach this machine, besides its addresses."""
     visitors: int = bounded(8, VISITORS)
-    """Most visitors at once."""
+    """Largest number of visitors at once."""
     open: bool = False
     """Also open the page in the browser."""
 
@@ -74,7 +74,7 @@ def run(command: Play, console: Console) -> int:
 
 
 def _savers() -> dict[str, Any]:
-    """Logs of robotics people's tools too, where their library is installed."""
+    """Functions that save an episode in other formats, by suffix: mcap if that package is installed."""
     try:
         import mcap  # noqa: F401
     except ModuleNotFoundError:

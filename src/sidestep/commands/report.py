@@ -28,8 +28,8 @@ class Report:
     """HTML file to write; report.html in the first folder, or beside the episode, by default. Its figures go
     into figures/ beside it, or NAME-figures/ for NAME.html."""
     episodes: int = bounded(100, least=0, most=10**8)
-    """Random episodes to run with a policy whose folder holds no record of any: for the histograms, the map
-    of interventions and the worst episodes. They are kept in the folder. 0 for none."""
+    """Random episodes to run with a policy without a survey: for the histograms, the map of interventions and
+    the worst episodes. They are kept in its folder. 0 for none."""
     film: VideoOptions = NO_VIDEO
 
 
@@ -66,7 +66,7 @@ def run(command: Report, console: Console) -> int:
 
 
 def _run_folders(paths: tuple[Path, ...], console: Console) -> list[Path]:
-    """The run folders, those of a reproduction one by one. A run counts once."""
+    """The run folders, including those of a reproduction. **Raises** `RunError` for a duplicate."""
     from sidestep.store.files import read_json
     from sidestep.store.runs import RunError
 
@@ -91,7 +91,7 @@ def _run_folders(paths: tuple[Path, ...], console: Console) -> list[Path]:
 
 
 def _refuse_other_files(path: Path) -> None:
-    """A report may be written anew, but nothing else written over."""
+    """**Raises** `ValueError` for an existing file that is not a report."""
     if path.is_file():
         with path.open("rb") as file:
             if b"<title>sidestep" not in file.read(1000):
@@ -99,14 +99,14 @@ def _refuse_other_files(path: Path) -> None:
 
 
 def _is_unseen(folder: Path) -> bool:
-    """Whether a run has a policy, but no record of any episode with it."""
+    """Whether a run has a policy, but no recorded episode with it."""
     from sidestep.trials import load_survey
 
     return (folder / "policy.npz").exists() and load_survey(folder) is None
 
 
 def _look_closer(folder: Path, episodes: int, console: Console) -> None:
-    """Run random episodes with the policy of a run, and keep them in its folder."""
+    """Survey a run's policy on random episodes, and keep the survey in its folder."""
     from sidestep.store.files import read_json
     from sidestep.store.lock import hold
     from sidestep.trials import save_survey, survey_run
@@ -117,7 +117,7 @@ def _look_closer(folder: Path, episodes: int, console: Console) -> None:
             survey = survey_run(folder, episodes, progress=show)
             save_survey(folder, survey)
     except (KeyError, ValueError) as error:
-        # A shield or pursuer of the user's own is known by its name alone, which brings nothing back.
+        # A custom shield or pursuer is stored by its name only, and cannot be restored.
         console.print(f"No episodes run for {folder}: {error}", highlight=False)
 
 
@@ -142,7 +142,7 @@ def _report_episode(command: Report, console: Console) -> int:
 
 
 def _read_episode(path: Path) -> tuple[Any, Any, Mapping[str, Any], Sequence[str]]:
-    """Scenario, trajectory, what is said of them, and what had to be worked out."""
+    """Scenario, trajectory, metadata, and notes on reconstructed data."""
     if path.suffix == ".mcap":
         from sidestep.bridges.logs import load_log
 

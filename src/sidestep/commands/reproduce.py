@@ -48,7 +48,7 @@ class Reproduce:
     episodes: int = bounded(unless_given(200), EPISODES)
     """Training episodes per shield (the paper's 200)."""
     evaluation_episodes: int = bounded(unless_given(1000), EPISODES)
-    """Random episodes to measure each trained policy on."""
+    """Random episodes on which each trained policy is measured."""
     seed: int = bounded(unless_given(0), SEED)
     """Seed of everything random."""
     set: Overrides = ()
@@ -56,8 +56,8 @@ class Reproduce:
     learner: Overrides = ()
     """Training options to change."""
     resume: bool = False
-    """Continue in --out with the settings it was begun with: finished parts are kept, an interrupted training
-    goes on where it stopped. Other options beside it must agree with those, --episodes too."""
+    """Resume in --out with the stored settings: finished parts are kept, an interrupted training continues.
+    Other options must agree with those, including --episodes."""
     json: Path | None = None
     """Also write the comparison to this file."""
 
@@ -76,7 +76,7 @@ def run(command: Reproduce, console: Console) -> int:
 
 
 def _study(command: Reproduce, resume: bool, console: Console) -> None:
-    """The study, its tables and its report."""
+    """Run the study, print its tables and write its report."""
     from sidestep.store.files import write_bytes
     from sidestep.store.runs import read_summary
     from sidestep.trials.reproduction import reproduce as run_study
@@ -98,7 +98,7 @@ def _study(command: Reproduce, resume: bool, console: Console) -> None:
     )
     summary = read_summary(command.out)
     sections = comparison_sections(summary)
-    console.print("Columns: what the paper reports, then our measurements under each shield.\n")
+    console.print("Columns: the paper's results, then the measurements with each shield.\n")
     for table in comparison_tables(sections):
         console.print(table)
         console.print()
@@ -113,7 +113,7 @@ def _study(command: Reproduce, resume: bool, console: Console) -> None:
 
 
 def comparison_tables(sections: list[Section]) -> Iterator[Any]:
-    """The paper's figures beside ours as tables of one layout; four shields fit into 80 columns."""
+    """The sections as tables of equal layout; four shields fit into 80 columns."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -131,7 +131,7 @@ def comparison_tables(sections: list[Section]) -> Iterator[Any]:
 
 
 def _as_begun(command: Reproduce, settings: Mapping[str, Any]) -> Reproduce:
-    """The command that the study of a resumed one was begun with."""
+    """The command with the stored settings of the resumed study."""
     from sidestep.learning import make_options, options_to_dict
     from sidestep.world import load_scenario, scenario_to_dict
 
@@ -147,7 +147,7 @@ def _as_begun(command: Reproduce, settings: Mapping[str, Any]) -> Reproduce:
 
 
 def command_line(command: Reproduce) -> str:
-    """What to paste to run the study again, beside the folder of this one: that is never written over."""
+    """The command line that runs the study again, in another folder."""
     parts = [command_of("reproduce", "--out", f"{command.out}-again")]
     plain = Reproduce()
     for name in ("shields", "pursuer", "episodes", "evaluation_episodes", "set", "learner"):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a policy with TD3 while a shield keeps the evader safe."""
+    """Train a policy with TD3 behind a shield."""
 
     out: Path
     """Run folder to write; never overwritten silently."""
@@ -40,10 +40,10 @@ class Train:
     shield: ShieldName = unless_given("joint")
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = unless_given("nash")
-    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; for what
-    cannot turn on the spot chauffeur."""
+    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; chauffeur
+    for robots that cannot turn on the spot."""
     episodes: int = bounded(unless_given(200), EPISODES)
-    """Episodes to train for; with --resume a larger number trains on to that total."""
+    """Training episodes; with --resume the new total, if larger."""
     seed: int = bounded(unless_given(0), SEED)
     """Seed of everything random; the same seed gives the same run on the same machine."""
     set: Overrides = ()
@@ -51,8 +51,7 @@ class Train:
     learner: Overrides = ()
     """Training options to change, such as discount=0.98 updates_per_decision=3."""
     resume: bool = False
-    """Continue the run in --out where it stopped, bit for bit, with the settings it was begun with. Other
-    options beside it must agree with those."""
+    """Resume the run in --out, bit for bit, with its stored settings. Other options must agree with those."""
     json: Path | None = None
     """Also write the summary to this file."""
 
@@ -88,7 +87,7 @@ def run(command: Train, console: Console) -> int:
 
 
 def training_table(summary: dict[str, Any]) -> Any:
-    """The figures of one training as a table."""
+    """The results of one training as a table."""
     from rich.table import Table
 
     table = Table(

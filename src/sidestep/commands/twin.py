@@ -30,13 +30,13 @@ class Twin(PhysicsCommand):
     sensors: Annotated[str, tyro.conf.arg(metavar="NAME")] = "motion-capture"
     """How poses are measured: perfect, motion-capture or odometry."""
     actuation_delay: float = bounded(0.0, DELAY)
-    """Seconds from a command to its effect."""
+    """Time from a command to its effect, s."""
     acceleration: float = bounded(2.0, ACCELERATION)
     """Limit of the evader's motors, m/s^2."""
     position_error: float | None = bounded(None, DISTANCE)
-    """Error of relative positions that the shield allows for, m; from the sensors by default."""
+    """Error of relative positions in the shield's budget, m; by default from the sensors."""
     log: Path | None = None
-    """Also write the first episode as an MCAP log of ROS 2 messages; never over a file that exists."""
+    """Also write the first episode as an MCAP log of ROS 2 messages; never overwrites a file."""
 
 
 def run(command: Twin, console: Console) -> int:

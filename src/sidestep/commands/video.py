@@ -1,4 +1,4 @@
-"""What the commands with an episode share: options of its video, checked before any work is done."""
+"""Video options of the commands that show an episode, checked before any work is done."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Video:
     """An animation of the episode: the world, the pursuer's frame and the shield's trace."""
 
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also animate it into this .mp4, .gif or .webp file; never over a file that exists."""
+    """Also animate it into this .mp4, .gif or .webp file; never overwrites a file."""
     video_speed: float = bounded(1.0, SPEED_UP)
-    """How many times faster than it was."""
+    """Speed as a factor on real time."""
     video_rate: int | None = bounded(None, least=1, most=120, whole=True)
     """Pictures per second; 30, or 20 for .gif and .webp, by default."""
     video_width: int | None = bounded(None, least=160, most=4096, whole=True, unit="pixels")
@@ -30,16 +30,16 @@ class Video:
     video_levels: Annotated[tuple[float, ...], tyro.conf.arg(metavar="[M ...]")] = bounded(
         (0.1, 0.2, 0.3), shape=(None,), empty=True, above=0.0, most=1e6, unit="m"
     )
-    """Levels of the barrier to draw beside level 0, in m; none make a .gif or .webp half as large."""
+    """Levels of the barrier to draw besides level 0, in m; without them a .gif or .webp is half as large."""
 
 
 NO_VIDEO = Video()
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
-"""The options under their own names, in a group of their own."""
+"""The options without a prefix, in a separate group of the help."""
 
 
 def check_options(options: Video) -> None:
-    """Raises `ValueError` for a video that cannot be written as asked; nothing is checked if none is."""
+    """**Raises** `ValueError` for a video that cannot be written; does nothing without one."""
     if options.video is None:
         return
     from sidestep.views.animation import check_numbers
@@ -57,7 +57,7 @@ def check_options(options: Video) -> None:
 def write_video(
     options: Video, scenario: Any, trajectory: Any, shield: str, console: Console, what: str = "the episode"
 ) -> None:
-    """Animate an episode if that was asked for, and say where."""
+    """Animate an episode if a file is given, and print its path."""
     if options.video is None:
         return
     from sidestep.views import animate
