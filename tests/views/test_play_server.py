@@ -24,7 +24,7 @@ from sidestep.loop.policies import as_policy
 from sidestep.views.play import Hosting, Limits, make_app
 from sidestep.views.play.server import PlayError, listen, make_server
 from sidestep.views.play.session import Session
-from sidestep.views.play.visitor import Allowance, Gone, Outbox, Visitor
+from sidestep.views.play.visitor import Gone, Outbox, TokenBucket, Visitor
 from sidestep.world import Scenario
 
 LIMITS = Limits(visitors=4, message_bytes=2048)
@@ -354,12 +354,12 @@ def test_what_a_replaced_frame_alone_said_is_not_lost():
 
 def test_an_allowance_fills_with_time_and_no_further_than_its_burst():
     now = [0.0]
-    allowance = Allowance(10.0, 3, lambda: now[0])
-    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
+    bucket = TokenBucket(10.0, 3, lambda: now[0])
+    assert [bucket.take() for _ in range(4)] == [True, True, True, False]
     now[0] = 0.15
-    assert [allowance.take() for _ in range(2)] == [True, False]
+    assert [bucket.take() for _ in range(2)] == [True, False]
     now[0] = 99.0
-    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
+    assert [bucket.take() for _ in range(4)] == [True, True, True, False]
 
 
 @pytest.mark.parametrize("field, value", [("shield", "armour"), ("pursuer", "dog")])

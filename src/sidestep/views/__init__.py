@@ -1,4 +1,4 @@
-"""What people see: figures, animations and the report."""
+"""Figures, animations, the report and the live page."""
 
 from sidestep.views.animation import animate
 from sidestep.views.capture_figure import capture_figure

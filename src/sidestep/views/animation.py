@@ -1,4 +1,4 @@
-"""An episode in motion, as a video: the world beside the frame of the pursuer, and the shield's trace."""
+"""Videos of episodes: the world, the pursuer's frame, and the shield's trace."""
 
 from __future__ import annotations
 
@@ -33,21 +33,26 @@ def animate(
     levels: Sequence[float] = LEVELS,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write an episode as a video: .mp4 (H.264), .gif or .webp, as the suffix of `path` says.
+    """Write an episode as a video: .mp4 (H.264), .gif or .webp, according to the suffix of `path`.
 
-    Left the world, right the evader as the nearest pursuer sees it, below the barriers and the corrections
-    over time, in the colours of the figures. Between control periods everybody moves as `Motion` says. It
-    ends with the outcome.
+    Left the world, right the evader in the frame of the nearest pursuer, below the barriers and the
+    corrections over time. `Motion` interpolates between control periods. The video ends with the outcome.
 
-    **Arguments:** `shield` its name, for words and for which barrier's levels are drawn; `title` instead of
-    the shield's; `speed` how many times faster than it was; `rate` pictures per second (30; 20 for .gif and
-    .webp); `width` in pixels, of which 9/16 are the height (1280; 720 for .gif and .webp); `hold` how long
-    (s) the end stays; `levels` (m, above 0) of the barrier to draw beside level 0: none make a .gif or
-    .webp half as large; `progress` is told how many pictures are done, and of how many.
+    **Arguments:**
 
-    **Returns** the path. A file that exists is replaced when the new one is complete; an interruption leaves
-    the old one, or nothing. **Raises** `VideoError` before any work when the file cannot be written as asked
-    or a package is missing (the extra `[video]`), or a number makes no sense.
+    - `shield`: its name, for texts and for the barrier whose levels are drawn
+    - `title`: replaces the shield's
+    - `speed`: factor on real time
+    - `rate`: pictures per second (30; 20 for .gif and .webp)
+    - `width` in pixels (1280; 720 for .gif and .webp); the height is 9/16 of it
+    - `hold`: time (s) for which the last picture stays
+    - `levels` (m, above 0) of the barrier to draw besides level 0; without them a .gif or .webp is half as
+      large
+    - `progress(done, total)`: called with numbers of pictures
+
+    **Returns** the path. An existing file is replaced when the new one is complete. **Raises** `VideoError`
+    before any work for an invalid number, when the file cannot be written, or when a package is missing (the
+    extra `[video]`).
     """
     path = check_video(path)
     suffix = path.suffix.lower()
@@ -60,7 +65,7 @@ def animate(
 
     def pictures() -> Iterator[np.ndarray]:
         for number, time in enumerate(times, start=1):
-            # The very end comes with the outcome, and stays for the hold.
+            # The last picture shows the outcome, and stays for the hold.
             yield stage.picture(float(time), end=number == len(times))
             if progress is not None:
                 progress(number, len(times))
@@ -82,8 +87,8 @@ def check_numbers(
     hold: float = 0.0,
     levels: Sequence[float] = LEVELS,
 ) -> None:
-    """**Raises** `VideoError` when `animate` could not take these arguments for this file."""
-    # Browsers slow down a GIF that is faster.
+    """**Raises** `VideoError` if `animate` does not accept these arguments for this file."""
+    # Browsers slow down faster GIFs.
     most = 50 if path.suffix.lower() == ".gif" else 120
     for name, value, bound in (
         ("speed", speed, SPEED_UP),

@@ -1,4 +1,4 @@
-"""The picture of one capture under the paper's shield: where, why, and how it came to it."""
+"""The figure of one capture under the paper's shield: where, why and how."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _SHOWN_SECONDS = 3.0
 def capture_figure(scenario: Scenario, trajectory: Trajectory, path: str | Path) -> tuple[Path, Path]:
     """One capture under the paper's shield, in three panels. Writes PNG and PDF; returns their paths.
 
-    a: the last seconds, zoomed; b: the velocities the evader could choose from when it was lost, with what
-    the shield's row asked for and what the pursuer's true motion asked for; c: both over time.
+    a: the last seconds, zoomed; b: the evader's possible velocities when it was lost, with the half planes of
+    the shield's row and of the pursuer's true motion; c: both over time.
 
     **Raises** `ValueError` when the episode did not end in a capture.
     """
@@ -99,7 +99,7 @@ def _draw_last_seconds(axes: Axes, scenario: Scenario, trajectory: Trajectory, c
 def _time_labels(
     axes: Axes, path: np.ndarray, marks: list[int], first: int, length: float, colour: str, *, dots: bool
 ) -> None:
-    # The shown part of the path begins at `first`; padding keeps the labels true to the episode's time.
+    # The shown part of the path begins at `first`; padding keeps the labels in the episode's time.
     padded = np.concatenate([np.repeat(path[:1], first, axis=0), path])
     side = 1.0 if dots else -1.0
     draw_time_marks(axes, padded, [mark + first for mark in marks], length, colour, dots=dots, side=side)

@@ -1,4 +1,4 @@
-"""A certificate's sets in the pursuer's frame: what captures, what the budget adds, where it is safe."""
+"""The sets of a certificate in the pursuer's frame: capture set, budget and safe set."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ _PARTS = (
 
 
 def certificate_figure(certificate: Certificate, path: str | Path) -> tuple[Path, Path]:
-    """The capture set, the same grown by each part of the budget, and the safe set. Writes PNG and PDF.
+    """The capture set, the capture set enlarged by each part of the budget, and the safe set. Writes PNG and
+    PDF; returns their paths.
 
-    a: all of it around the pursuer, with the usable part of the capture circle and the stand-off points
-    +-b cot S; b: the tip, where margins of millimetres can be seen. Where the pursuer wins, one panel: no
-    place is safe, so none is tinted as safe. Returns the paths.
+    a: all sets around the pursuer, with the usable part of the capture circle and the stand-off points
+    +-b cot S; b: the tip, where margins of millimetres are visible. If the pursuer wins, there is one panel
+    without a safe set.
     """
     with style.house_style():
-        # Where the pursuer wins there is no budget, and the tip would repeat the whole.
+        # If the pursuer wins there is no budget, and the tip would show nothing new.
         split = not certificate.pursuer_wins
         figure = style.new_figure(style.WIDTH, 4.4)
         grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], height_ratios=[1.0, 0.36])
@@ -69,7 +70,7 @@ def _wanted(certificate: Certificate) -> float:
 
 
 def set_outline(radius: float, angle: float, points: int = 181) -> Float[np.ndarray, "n 2"]:
-    """Outline (m, closed) of a disc with tips whose sides have normals `angle` (rad) from the axis."""
+    """Outline (m, closed) of a disc with tips whose sides have normals at `angle` (rad) to the axis."""
     left = np.linspace(angle, np.pi - angle, points)
     arc = radius * np.stack([np.cos(left), np.sin(left)], -1)
     apex = np.array([[radius / math.cos(angle), 0.0]])
@@ -77,7 +78,7 @@ def set_outline(radius: float, angle: float, points: int = 181) -> Float[np.ndar
 
 
 def _grown(certificate: Certificate) -> list[tuple[str, str, float]]:
-    """Label, colour and radius of every budget part that is not 0, outward; none where the pursuer wins."""
+    """Label, colour and radius (m) of every budget part that is not 0, outward; none if the pursuer wins."""
     radius, sets = _wanted(certificate), []
     if certificate.pursuer_wins:
         return sets
@@ -142,7 +143,7 @@ def _draw_pursuer_and_marks(axes: Axes, certificate: Certificate) -> None:
 
 
 def _outside(certificate: Certificate) -> tuple[str, str]:
-    """What holds outside the sets, and its colour."""
+    """The text on what holds outside the sets, and its colour."""
     held, kept = _wanted(certificate), certificate.guaranteed_clearance
     if certificate.pursuer_wins:
         smaller = f"\n({kept:.4g} m is kept for ever)" if kept > 0.0 else ""

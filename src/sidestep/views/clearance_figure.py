@@ -1,4 +1,4 @@
-"""How near to capture and to collision each episode came: histograms per shield."""
+"""Histograms of each episode's least clearances, per shield."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HAZARDS = (
 )
 _TICKS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0)
 _BINS_PER_ROOT = 24
-"""Bins in the square root of a metre, so that millimetres and metres are told apart in one histogram."""
+"""Number of bins on a square-root scale, which resolves both millimetres and metres."""
 
 
 def clearance_figure(
@@ -32,11 +32,11 @@ def clearance_figure(
 ) -> tuple[Path, Path]:
     """Histograms of the least clearance to pursuers and to obstacles of every episode, a row per shield.
 
-    The distance is that beyond the capture or collision distance, on a square-root scale; counts are
-    logarithmic, so that one lost episode among a thousand is seen. Contacts (0 and less) are one bar, apart.
+    Clearances are on a square-root scale; counts are logarithmic, so that one lost episode among a thousand
+    is visible. Contacts (0 and less) are one separate bar.
 
-    **Arguments:** `clearances` by shield: those to pursuers and those to obstacles, m, infinite without
-    such a robot. Writes PNG and PDF.
+    **Arguments:** `clearances` by shield: to pursuers and to obstacles, m, infinite without such a robot.
+    Writes PNG and PDF.
     """
     names = list(clearances)
     hazards = [
@@ -75,7 +75,7 @@ def clearance_figure(
 
 
 def _edges(highest: float) -> Float[np.ndarray, "edges"]:
-    """Edges of bins (m), equally wide in the square root."""
+    """Edges of bins (m), of equal width in the square root."""
     count = max(4, int(np.ceil(_BINS_PER_ROOT * np.sqrt(highest))))
     return (np.arange(count + 1) / _BINS_PER_ROOT) ** 2
 
@@ -91,7 +91,7 @@ def _draw(
     index: int,
     colour: str,
 ) -> float:
-    """One histogram; its highest bar."""
+    """Draw one histogram; returns its highest bar."""
     finite = clearances[np.isfinite(clearances)]
     contacts = int(np.sum(finite <= 0.0))
     counts, _ = np.histogram(finite[finite > 0.0], edges)

@@ -1,4 +1,4 @@
-"""A reproduction study as tables: the paper's figures, then a column per shield, from its summary alone."""
+"""Tables of a reproduction study from its summary: a column with the paper's results, then one per shield."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ OUTCOME_ROWS = (
 )
 UNKNOWN = "-"
 REPORTED = "reported"
-"""The column of what the paper reports; the others have the names of the shields."""
+"""The title of the column with the paper's results."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """One table: its title, the names of its columns (first what the paper reports), and its labelled rows.
+    """One table: its title, the names of its columns (the paper's first), and its labelled rows.
 
-    Labels are at most 23 characters wide and cells 9, so that four shields fit a terminal of 80 columns. A
-    label that begins with a space belongs to the row above it.
+    Labels have at most 23 characters and cells 9, so that four shields fit into 80 columns. A label that
+    begins with a space belongs to the row above it.
     """
 
     title: str
@@ -33,10 +33,10 @@ class Section:
 def comparison_sections(summary: Mapping[str, Any]) -> list[Section]:
     """The tables of a study.
 
-    **Arguments:** `summary` what `reproduce` writes to `summary.json`; nothing else is shown.
+    **Arguments:** `summary`, the content of `summary.json` of `reproduce`.
 
-    **Returns** training, random starts with the learned and with the goal-seeking policy, and the test scene
-    with each. Periods with invalid input have a row only where there were any.
+    **Returns** the tables of the training, of random starts with the learned and the goal-seeking policy, and
+    of the test scene with each. Periods with invalid input have a row only if there were any.
     """
     shields, paper = summary["shields"], summary["paper"]
     sections = [
@@ -52,7 +52,7 @@ def comparison_sections(summary: Mapping[str, Any]) -> list[Section]:
 
 
 def markdown_tables(sections: Sequence[Section]) -> str:
-    """The tables as Markdown, for a page or a message."""
+    """The tables as Markdown."""
     lines: list[str] = []
     for section in sections:
         head = ["", *section.columns]
@@ -90,7 +90,7 @@ def _section(
 
 
 def _share(name: str) -> Show:
-    """A share in per cent; only nothing is 0 %, and only everything is 100 %."""
+    """A share in per cent; rounding never gives 0 % or 100 % unless exact."""
 
     def show(figures: Figures) -> str:
         share = figures[name]
@@ -113,7 +113,7 @@ def _count(name: str) -> Show:
 def _decimals(name: str, digits: int) -> Show:
     def show(figures: Figures) -> str:
         value = figures[name]
-        # Adding 0.0 makes a negative zero positive.
+        # Adding 0.0 turns -0.0 into 0.0.
         return UNKNOWN if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
     return show
@@ -129,7 +129,7 @@ def _invalid(figures: Figures) -> str:
 
 
 def _stays_from(figures: Figures) -> str:
-    # Neither the paper nor a summary from before 0.2 says.
+    # Missing in the paper and in summaries before version 0.2.
     if "converged_stays_from" not in figures:
         return UNKNOWN
     episode = figures["converged_stays_from"]

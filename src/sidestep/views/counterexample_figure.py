@@ -1,4 +1,4 @@
-"""The picture of a counterexample: where it happened, how it looked to the pursuer, and by how little."""
+"""The figure of a counterexample: scene, pursuer's frame, clearances and wheel speeds."""
 
 from __future__ import annotations
 
@@ -39,11 +39,10 @@ def counterexample_figure(
 ) -> tuple[Path, Path]:
     """One lost episode, its last six seconds, in four panels. Writes PNG and PDF; returns their paths.
 
-    a: the scene; b: the evader as the pursuer that was nearest in the end sees it, with its capture set;
-    c: what was left to capture and to collision; d: what that pursuer's wheels did.
+    a: the scene; b: the evader in the frame of the pursuer that is nearest at the end, with its capture set;
+    c: clearances from capture and collision; d: that pursuer's wheel speeds.
 
-    **Arguments:** `shield` its name, for words; `words` what to say below the title, such as the assumption
-    that was broken.
+    **Arguments:** `shield` its name, for texts; `words` below the title, such as the broken assumption.
     """
     first = max(0, trajectory.length - round(_SHOWN_SECONDS / float(scenario.control_period)))
     nearest = _nearest(trajectory)
@@ -87,7 +86,7 @@ def _draw_scene(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: i
     shown = [evader[first:], poses[first:, :, :2].reshape(-1, 2)]
     reach = float(scenario.collision_distance)
     for centre in np.asarray(worlds.obstacles)[end, :, :2]:
-        # An obstacle far from everything would make the picture small.
+        # A distant obstacle would make the scene small.
         if np.hypot(*(centre - evader[end])) < reach + 0.6:
             shown += [centre + reach * np.array([[-1.0, -1.0], [1.0, 1.0]])]
     around = float(np.abs(capture_set_outline(scenario)).max())
@@ -137,7 +136,7 @@ def _draw_seen(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer: 
 
 
 def _draw_gaps(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: int) -> None:
-    """Clearances and margins over time, in mm near 0 and in m beyond."""
+    """Clearances and margins over time, linear near 0 and logarithmic beyond."""
     times = (np.arange(first, trajectory.length) + 1) * float(scenario.control_period)
     margin = _margins(scenario, trajectory)[first + 1 :]
     curves: list[tuple[Any, str, str]] = [
@@ -150,7 +149,7 @@ def _draw_gaps(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: in
     for values, colour, label in curves:
         axes.plot(times, np.asarray(values), color=colour, linewidth=1.3, label=label)
     axes.axhline(0.0, color=style.INK, linewidth=1.0)
-    # Straight within a fraction of a millimetre of 0, logarithmic beyond: both matter here.
+    # Linear within a fraction of a millimetre of 0, logarithmic beyond.
     axes.set_yscale("symlog", linthresh=1e-4, linscale=0.6)
     ticks = [-0.1, -0.01, -0.001, -0.0001, 0.0, 0.0001, 0.001, 0.01, 0.1, 1.0]
     labels = ["−10 cm", "−1 cm", "−1 mm", "−0.1 mm", "0", "0.1 mm", "1 mm", "1 cm", "10 cm", "1 m"]
@@ -165,7 +164,7 @@ def _draw_gaps(axes: Axes, scenario: Scenario, trajectory: Trajectory, first: in
 
 
 def _margins(scenario: Scenario, trajectory: Trajectory) -> np.ndarray:
-    """h (m) towards the capture set, the least over pursuers, at each instant."""
+    """h (m), the least over pursuers, at each control instant."""
     evader, poses = np.asarray(trajectory.worlds.evader), np.asarray(trajectory.worlds.pursuers)
     return pursuer_heights(scenario, evader[:, None], poses, pursuit=True).min(axis=1)
 
@@ -190,7 +189,7 @@ def _draw_wheels(axes: Axes, scenario: Scenario, trajectory: Trajectory, pursuer
 
 
 def _legend_above(axes: Axes, **entries: Any) -> None:
-    """The key to the right of the title, where no curve runs."""
+    """The legend to the right of the title, where no curve is."""
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderpad=0.1, borderaxespad=0.2, **entries
     )

@@ -1,4 +1,4 @@
-"""The report of one episode, such as a log holds: one HTML file that needs nothing else."""
+"""The report of one episode, for example of a log, as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def write_episode_report(
 ) -> Path:
     """Draw an episode and write its report; returns the HTML file's path.
 
-    **Arguments:** `about` what to say of it by name, `shield` among it for the figure; `notes` what is
-    missing; `figures` the folder for the figure as PNG and PDF (`figures` beside `path` if not given).
+    **Arguments:** `about` metadata by name, including `shield` for the figure; `notes` on missing data;
+    `figures` the folder for the figure as PNG and PDF (default: `figures` beside `path`).
     """
     path, about = Path(path), dict(about or {})
     folder = path.parent / "figures" if figures is None else Path(figures)
@@ -65,7 +65,7 @@ def write_episode_report(
 
 
 def _cards(trajectory: Trajectory) -> list[tuple[str, str, str]]:
-    """Name, number and unit of what one wants to know first."""
+    """Name, number and unit of the most important results."""
     status, changed = np.asarray(trajectory.status), np.asarray(trajectory.intervention)
     cards = []
     for name, clearance in (

@@ -1,4 +1,4 @@
-"""How numbers and pictures are put into HTML."""
+"""Numbers and pictures in HTML."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image
 
 
 def data_uri(png: Path) -> str:
-    """A PNG as a data URI, in 256 colours, which is a third of the size: a report is mailed about."""
+    """A PNG as a data URI, reduced to 256 colours, a third of the size."""
     buffer = BytesIO()
     with Image.open(png) as picture:
         picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
@@ -19,12 +19,12 @@ def data_uri(png: Path) -> str:
 
 
 def shown_number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
-    """A number for readers; a dash for none."""
+    """A formatted number; a dash for None."""
     return "–" if value is None else f"{value:,.{digits}f}{unit}".replace("-", "−").replace(" ", "\u00a0")
 
 
 def shown_value(value: Any) -> str:
-    """A setting for readers."""
+    """A formatted setting."""
     if value is None:
         return "random"
     return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)

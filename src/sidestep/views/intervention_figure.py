@@ -1,4 +1,4 @@
-"""Where the shield steps in: the evader's places in the pursuer's frame, with the sets that it is about."""
+"""Maps of interventions over the evader's position in the pursuer's frame."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from sidestep.world import Scenario
 from sidestep.world.capture_geometry import capture_set_distance
 
 _FEWEST = 5
-"""Cells visited in fewer periods are left white: a share of three periods says nothing."""
+"""Cells with fewer periods are left white: the share of a few periods is not meaningful."""
 _LEVELS = (0.05, 0.1, 0.2, 0.3)
 _ARROWS = 15
 _LEAST_SIDE = 1.3
-"""Inches; with more shields than fit a page at this size the figure becomes wider."""
+"""Least width (inches) of a panel; with many shields the figure becomes wider than a page."""
 _HALO = [withStroke(linewidth=2.0, foreground="white")]
 
 
 def intervention_figure(
     scenario: Scenario, maps: Mapping[str, InterventionMap], path: str | Path
 ) -> tuple[Path, Path]:
-    """Above, the share of control periods in which the shield changed the velocity, by where the evader was
-    in the nearest pursuer's frame; below, by how much on average, arrows for the direction.
+    """Maps over the evader's position in the nearest pursuer's frame, a column per shield. Above: the share
+    of control periods in which the shield changed the velocity. Below: the mean correction, with its
+    direction.
 
-    A column per shield. Drawn over it: the capture circle, its usable part (thick), the capture set K
-    (dashed), the wheels of the pursuer, which heads to the right, and level sets of the barrier that the
-    shield keeps. Writes PNG and PDF.
+    Also drawn: the capture circle, its usable part (thick), the capture set K (dashed), the wheels of the
+    pursuer, which heads to the right, and level sets of the shield's barrier. Writes PNG and PDF.
     """
     names = list(maps)
     columns = max(len(names), 1)
@@ -83,7 +83,7 @@ def intervention_figure(
 
 
 def _share_colours() -> Colormap:
-    """From light for never to dark for always, far enough from white, which is for places never visited."""
+    """From light (never) to dark (always), and distinct from the white of cells not visited."""
     whole = matplotlib.colormaps["YlGnBu"]
     return LinearSegmentedColormap.from_list("share", whole(np.linspace(0.3, 1.0, 128)))
 
@@ -134,7 +134,7 @@ def _blocks(values: Float[np.ndarray, "cells cells"]) -> Float[np.ndarray, "arro
 
 
 def _draw_directions(axes: Axes, one: InterventionMap) -> None:
-    """Arrows along the mean correction, for blocks of cells in which there is one to speak of."""
+    """Arrows along the mean correction, for blocks of cells in which it is not negligible."""
     periods = _blocks(one.periods.astype(float))
     weight = np.maximum(periods, 1)
     ahead, left = _blocks(one.ahead) / weight, _blocks(one.left) / weight

@@ -1,4 +1,4 @@
-"""Which labels have room? Each goes to the first free place around its point, or is left out."""
+"""Place labels without overlap: each at the first free position around its point, or not at all."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from matplotlib.text import Annotation, Text
 from matplotlib.transforms import Bbox
 
 _DOT = 2.5
-"""Points: half the width of what is kept free around every labelled point."""
+"""Half the width (points) of the square that is kept free around every labelled point."""
 
 
 @final
 class Label(Annotation):
-    """A text beside a point of the data. `place_labels` chooses its place.
+    """A text beside a point of the data, positioned by `place_labels`.
 
-    **Arguments:** `point` in data units; `places` offsets from it in points, the best one first; `rank` which
-    labels go first where room is short, the lowest rank first.
+    **Arguments:** `point` in data units; `places`, offsets from it in points, the best one first; `rank`,
+    labels with the lowest rank are placed first.
     """
 
     def __init__(
@@ -39,8 +39,8 @@ class Label(Annotation):
 
 
 def place_labels(figure: Figure) -> None:
-    """Move every `Label` to the first of its places where it is inside its axes and covers no other text and
-    no labelled point; hide those for which there is none."""
+    """Move every `Label` to its first place inside the axes that covers no text and no labelled point; hide
+    labels without such a place."""
     figure.draw_without_rendering()
     for axes in figure.axes:
         labels = [child for child in axes.get_children() if isinstance(child, Label)]

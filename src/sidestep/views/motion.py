@@ -1,4 +1,4 @@
-"""Where is everybody between two control periods?"""
+"""Interpolation of an episode between control instants."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _Angles = np.ndarray | np.floating
 
 
 def turn_between(before: _Angles, after: _Angles) -> _Angles:
-    """The angle (rad) from one heading to another the short way round, in [-pi, pi)."""
+    """The smaller angle (rad) from one heading to another, in [-pi, pi)."""
     return (after - before + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def relative(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """z = R(-theta)(p - p_d): points (..., 2) of the world in frames (..., 3) of x, y (m), heading (rad)."""
+    """z = R(-theta)(p - p_d): world points (..., 2) in frames (..., 3) given by x, y (m), heading (rad)."""
     return turned_back(points - poses[..., :2], poses[..., 2])
 
 
 def turned_back(vectors: np.ndarray, headings: _Angles) -> np.ndarray:
-    """Vectors (..., 2) of the world along the axes of frames with these headings (rad)."""
+    """World vectors (..., 2) in the axes of frames with these headings (rad)."""
     cosine, sine = np.cos(headings), np.sin(headings)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
@@ -34,9 +34,9 @@ def turned_back(vectors: np.ndarray, headings: _Angles) -> np.ndarray:
 @final
 @dataclass(frozen=True)
 class Instant:
-    """Everything at one time, in the frame of the world or of a pursuer; m, m/s and rad.
+    """The state at one time, in the frame of the world or of a pursuer; m, m/s and rad.
 
-    **Attributes:** `time` s; `period` the control period it falls into; `evader (2,)`, `poses (m, 3)`,
+    **Attributes:** `time` s; `period` the number of its control period; `evader (2,)`, `poses (m, 3)`,
     `obstacles (k, 2)`, `target (2,)`; `nominal (2,)` and `action (2,)` velocities of that period.
     """
 
@@ -50,7 +50,7 @@ class Instant:
     action: Float[np.ndarray, "2"]
 
     def seen_from(self, pose: Float[np.ndarray, "3"]) -> Instant:
-        """The same with this pose as the origin and its heading as the x axis."""
+        """The same in the frame of this pose."""
         headings = np.asarray(turn_between(pose[2], self.poses[:, 2]))
         return replace(
             self,
@@ -65,15 +65,15 @@ class Instant:
 
 @final
 class Motion:
-    """An episode at any time, and not only where its control periods begin.
+    """An episode at any time, interpolated between control instants.
 
-    Evader and obstacles move in a straight line from one recorded place to the next, headings turn at a
-    constant rate the short way round, and pursuers follow the arc between two poses that belongs to it:
+    Evader and obstacles move in straight lines, headings change at a constant rate by the smaller angle, and
+    pursuers move on the arc between two poses:
 
         p(s) = p_0 + R(-(1 - s) D/2) (p_1 - p_0) s sinc(s D/2) / sinc(D/2),   s in [0, 1], D the turn.
 
-    For the simulation, which holds velocities and wheel speeds over a period, this is exact. What other
-    robots did in between was not recorded; there it is a smooth way through every recorded pose.
+    This is exact for the simulation, in which velocities and wheel speeds are constant over a period. For
+    other robots it is a smooth interpolation of the recorded poses.
     """
 
     def __init__(self, scenario: Scenario, trajectory: Trajectory):
@@ -89,22 +89,23 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """Length of the episode, s."""
+        """Duration of the episode, s."""
         return self.length * self.period
 
     def _split(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Control period and share of it that has passed; the very end belongs to the last period."""
-        # A time that is a whole number of periods but for its last digits begins that period.
+        """Control period and the share of it that has passed; the end of the episode belongs to the last
+        period."""
+        # A time within rounding of a whole number of periods begins that period.
         passed = np.clip(np.asarray(times, float) / self.period + 1e-9, 0.0, self.length)
         index = np.minimum(np.floor(passed).astype(int), self.length - 1)
         return index, np.clip(passed - index, 0.0, 1.0)
 
     def evader(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Where the evader is at these times (s)."""
+        """The evader's positions (m) at these times (s)."""
         return _straight(self._evader, *self._split(times))
 
     def poses(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 3"]:
-        """Where the pursuers are, and head, at these times (s)."""
+        """The pursuers' poses (m, rad) at these times (s)."""
         index, share = self._split(times)
         before, after, share = self._poses[index], self._poses[index + 1], share[:, None]
         turn = np.asarray(turn_between(before[..., 2], after[..., 2]))
@@ -114,11 +115,11 @@ class Motion:
         return np.concatenate([places, (before[..., 2] + share * turn)[..., None]], axis=-1)
 
     def obstacles(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n k 2"]:
-        """Where the obstacles are at these times (s)."""
+        """The obstacles' positions (m) at these times (s)."""
         return _straight(self._obstacles, *self._split(times))
 
     def at(self, time: float) -> Instant:
-        """Everything at one time (s)."""
+        """The state at one time (s)."""
         times = np.array([time])
         period = int(self._split(times)[0][0])
         return Instant(
@@ -141,10 +142,10 @@ def _straight(path: np.ndarray, index: np.ndarray, share: np.ndarray) -> np.ndar
 def nearest_pursuers(
     evader: Float[np.ndarray, "n 2"], poses: Float[np.ndarray, "n m 3"], keep: float = 0.85
 ) -> np.ndarray:
-    """Which pursuer to look from at each of n instants: the nearest, but it must be clearly nearer.
+    """The pursuer whose frame is shown, at each of n instants: the nearest one, with hysteresis.
 
-    Another one takes over when its distance is less than `keep` times that of the present one, so that the
-    view does not flicker between two that are about equally near.
+    Another pursuer is chosen when its distance is less than `keep` times that of the present one, so that the
+    view does not flicker between two of similar distance.
     """
     distances = np.hypot(*np.moveaxis(poses[..., :2] - evader[:, None], -1, 0))
     chosen = np.empty(len(distances), int)

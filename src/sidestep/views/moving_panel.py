@@ -1,4 +1,4 @@
-"""One panel of an animation: robots, distances and ways in some frame, moved from picture to picture."""
+"""One panel of an animation: robots, distances and trails in a frame, updated for every picture."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _HALO = [withStroke(linewidth=1.8, foreground="white")]
 
 @final
 class _Arrow:
-    """A velocity, from where the evader is."""
+    """A velocity arrow at the evader."""
 
     def __init__(self, axes: Axes, speed_limit: float, colour: str, *, dashes: Any = "solid", zorder: float):
         height = float(np.ptp(axes.get_ylim()))
@@ -43,7 +43,7 @@ class _Arrow:
         axes.add_patch(self.head)
 
     def show(self, place: np.ndarray, velocity: np.ndarray) -> None:
-        """Point along `velocity` (m/s); nothing is shown of a standstill."""
+        """Show `velocity` (m/s); nothing if it is zero."""
         length = self._seconds * float(np.hypot(*velocity))
         visible = length > 0.3 * self._head
         self.shaft.set_visible(visible)
@@ -58,14 +58,14 @@ class _Arrow:
 
 @final
 class _Pursuer:
-    """A differential drive to scale, any other pursuer as a sign of its place, with its capture circle and
-    its capture set K."""
+    """A pursuer with its capture circle and its capture set K; a differential drive is drawn to scale, any
+    other as a symbol."""
 
     def __init__(self, axes: Axes, scenario: Scenario, number: str):
         axle = scene.drawn_half_axle(scenario)
         self._outline = scene.capture_set_outline(scenario, 61)
         self._circle = float(scenario.capture_distance) * _CIRCLE
-        # The axle is true; wheels and body are as large as fits it and the capture circle.
+        # The axle is to scale; wheels and body fit it and the capture circle.
         room = min(axle, float(scenario.capture_distance))
         length = 0.5 * room
         wheel = 0.5 * length * np.array([[-1.0, -0.32], [1.0, -0.32], [1.0, 0.32], [-1.0, 0.32]])
@@ -97,11 +97,11 @@ class _Pursuer:
 
     @property
     def artists(self) -> list[Artist]:
-        """What is drawn anew for every picture."""
+        """The artists that change with every picture."""
         return [*(part for part, _ in self._parts), self._number]
 
     def show(self, pose: np.ndarray) -> None:
-        """Put everything where the pursuer is."""
+        """Move all artists to the pursuer's pose."""
         for part, shape in self._parts:
             moved = scene.to_world(shape, pose)
             if isinstance(part, Line2D):
@@ -114,10 +114,10 @@ class _Pursuer:
 
 @final
 class MovingPanel:
-    """Everything that is to be seen of an instant, in axes whose limits are set and stay.
+    """Draws an instant in axes with fixed limits.
 
-    **Arguments:** `trails` how many ways there are to draw beside the evader's; `pursuit` which barrier's
-    levels are drawn, see `LevelOutlines`, and `levels` (m) which beside 0.
+    **Arguments:** `trails` number of trails besides the evader's; `pursuit` the barrier whose levels are
+    drawn, see `LevelOutlines`; `levels` (m) to draw besides 0.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class MovingPanel:
         collision = float(scenario.collision_distance)
         self._rocks: list[tuple[Circle, Circle, Line2D]] = []
         for _ in instant.obstacles:
-            area, edge = style.draw_disc(axes, (0, 0), collision, style.OBSTACLE, alpha=0.18)
+            area, edge = style.draw_disc(axes, (0.0, 0.0), collision, style.OBSTACLE, alpha=0.18)
             (dot,) = axes.plot([], [], "o", color=style.OBSTACLE, markersize=4, zorder=5)
             self._rocks.append((area, edge, dot))
         self._pursuers = [
@@ -186,8 +186,8 @@ class MovingPanel:
         corrected: Float[np.ndarray, "k 2 2"],
         colours: Float[np.ndarray, "k 4"],
     ) -> None:
-        """Draw ways: the evader's, an older part of it faintly, those of others with their colours, and the
-        pieces of the evader's on which the shield stepped in, with the colours of the corrections."""
+        """Draw trails: the evader's, an older part of it faintly, those of other robots with their colours,
+        and the pieces of the evader's trail with an intervention, in the colours of the corrections."""
         self._faint.set_data(*faint.T)
         for line, (way, colour) in zip(self._trails, [(evader, style.EVADER), *others], strict=True):
             line.set_data(*way.T)
@@ -196,7 +196,7 @@ class MovingPanel:
         self._corrected.set_color(list(map(tuple, colours)))
 
     def show(self, now: Instant, outcome: str | None = None) -> None:
-        """Put everything where it is now; with the `outcome` of the episode at its end."""
+        """Update all artists; `outcome` is that of the episode, at its end."""
         for pursuer, pose in zip(self._pursuers, now.poses, strict=True):
             pursuer.show(pose)
         for (area, edge, dot), place in zip(self._rocks, now.obstacles, strict=True):
@@ -219,7 +219,7 @@ class MovingPanel:
         self._show_beyond(now.evader)
 
     def _show_beyond(self, evader: np.ndarray) -> None:
-        """Where the evader is outside the panel: in which direction, and how far away."""
+        """Show direction and distance of an evader outside the panel."""
         limits = np.array([self.axes.get_xlim(), self.axes.get_ylim()])
         inside = bool(np.all((evader >= limits[:, 0]) & (evader <= limits[:, 1])))
         self._beyond.set_visible(not inside)

@@ -1,4 +1,4 @@
-"""Where are the levels of a barrier? Their outlines, computed exactly instead of on a grid."""
+"""Level sets of the barriers, as exact outlines."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def pursuer_heights(
 ) -> Float[np.ndarray, "..."]:
     """h (m) of evader positions towards pursuers: the game's barrier with `pursuit`, else |p_e - p_d| - l.
 
-    The game's is the signed distance from the capture set K, which is |x| cos S + |y| sin S - l in front of
-    the pursuer and behind it, and |z| - l aside.
+    The game's barrier is the signed distance from the capture set K: |x| cos S + |y| sin S - l within the
+    usable angle of the pursuer's axis, and |z| - l elsewhere.
     """
     scenario = scene.guarded(scenario)
     usable = float(scenario.usable_angle) if pursuit else None
@@ -46,10 +46,10 @@ def _heights(points: np.ndarray, pose: np.ndarray, capture: float, usable: float
 
 @final
 class LevelOutlines:
-    """Where the least barrier over all robots has a certain value, all but the evader held in place.
+    """Level sets of the least barrier over all robots, as a function of the evader's position.
 
-    Around each robot the level c > 0 of its own barrier has the shape of its level 0, only larger by c; the
-    parts of it at which another barrier is lower are left out. `pursuit` as for `pursuer_heights`.
+    The level c > 0 of one robot's barrier is its level 0 enlarged by c. Parts where another barrier is lower
+    are left out. `pursuit` as for `pursuer_heights`.
     """
 
     def __init__(self, scenario: Scenario, *, pursuit: bool):
@@ -65,7 +65,7 @@ class LevelOutlines:
     def at(
         self, poses: Float[np.ndarray, "m 3"], obstacles: Float[np.ndarray, "k 2"], level: float
     ) -> Float[np.ndarray, "n 2"]:
-        """The level (m) around pursuers and obstacles: closed, NaN between them and where they are cut."""
+        """Outlines of this level (m): closed, with NaN between them and where they are cut."""
         outlines = [scene.to_world((self._capture + level) * self._shape, pose) for pose in poses]
         outlines += [centre + (self._collision + level) * self._circle for centre in obstacles]
         for one, outline in enumerate(outlines):
@@ -84,7 +84,7 @@ class LevelOutlines:
 def draw_barrier_levels(
     axes: Axes, scenario: Scenario, world: World, *, pursuit: bool, levels: Sequence[float] = scene.LEVELS
 ) -> None:
-    """Level sets of the composed barrier h = min_i h_i over evader positions, all others held in place."""
+    """Draw level sets of h = min_i h_i over evader positions, with all other robots fixed."""
     outlines = LevelOutlines(scenario, pursuit=pursuit)
     poses, obstacles = np.asarray(world.pursuers), np.asarray(world.obstacles)[:, :2]
     for level in levels:
@@ -95,7 +95,7 @@ def draw_barrier_levels(
 
 
 def _dense(outline: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """The same outline with more points on its straight parts, so that it can be cut there."""
+    """The outline with more points on its straight parts, so that it can be cut there."""
     longest = 2.0 * np.median(np.hypot(*np.diff(outline, axis=0).T))
     parts = []
     for start, end in pairwise(outline):

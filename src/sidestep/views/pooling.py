@@ -1,4 +1,4 @@
-"""Evaluations of several runs as one, from what each left on disk."""
+"""Pool the stored evaluations of several runs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _SHARES = ("intervention_rate", "infeasible_rate", "invalid_rate", "mean_correct
 
 
 def pooled_evaluation(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What the tables and the outcome figure show of `Evaluation.to_dict`, over all of these evaluations.
+    """The entries of `Evaluation.to_dict` that tables and the outcome figure show, pooled.
 
-    Counts add up and get new bounds; shares of control periods are weighted by the periods of each (by its
-    episodes where an evaluation does not say). A median of several is not known from theirs, so it is None.
-    One evaluation is given back as it is.
+    Counts are added and get new bounds. Shares of control periods are weighted by the numbers of periods (by
+    episodes if unknown). The median is None, because it cannot be pooled. A single evaluation is returned
+    unchanged.
     """
     if len(reports) == 1:
         return dict(reports[0])

@@ -1,4 +1,4 @@
-"""Recorded episodes packed into a page, for its player: the last seconds around the tightest moment."""
+"""Recorded episodes in a report, for its player: some seconds around the least clearance."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from sidestep.views.style import OUTCOME_WORDS, shield_words
 from sidestep.world import Scenario
 
 BEFORE, AFTER = 20.0, 6.0
-"""Seconds shown before and after the tightest moment; an episode may last for minutes."""
+"""Seconds shown before and after the least clearance; an episode may last for minutes."""
 
 _STATIC = Path(__file__).parent / "play" / "static"
 _STEPS = 65535
 
 
 def tightest(episode: WorstEpisode) -> int:
-    """The control period in which an episode came nearest to what it was chosen for."""
+    """The control period with the least clearance of the hazard for which the episode was chosen."""
     events = episode.trajectory.events
     nearness = events.pursuer_clearance if episode.hazard == "capture" else events.obstacle_clearance
     return int(np.argmin(np.asarray(nearness)))
@@ -38,23 +38,23 @@ def tightest(episode: WorstEpisode) -> int:
 def episodes_for_page(
     scenario: Scenario, shield: str, episodes: Sequence[WorstEpisode]
 ) -> list[dict[str, Any]]:
-    """What the player needs of these episodes of one run, as plain JSON values.
+    """The player's data of these episodes of one run, as JSON values.
 
-    Every series is packed as 16-bit steps between its least and its greatest value, so that metres and
-    millimetres keep four to five digits.
+    Every series is quantised to 16 bits between its least and its largest value, which keeps four to five
+    digits.
     """
     return [_packed(scenario, shield, episode) for episode in episodes]
 
 
 def player(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Markup]:
-    """What the page's template puts in: `data` as JSON, `script`, and `colours` as a style sheet.
+    """The player's parts for the page template: `data` as JSON, `script`, and `colours` as a style sheet.
 
-    The scene is drawn by the live page's own code, in its colours.
+    It uses the drawing code and the colours of the live page.
     """
     scene = (_STATIC / "scene.js").read_text(encoding="utf-8")
     text = json.dumps(list(episodes), allow_nan=False, separators=(",", ":"))
     return {
-        # A script element ends at the first "</", wherever it stands.
+        # A script element ends at the first "</", even inside a string.
         "data": Markup(text.replace("<", "\\u003c")),
         "script": Markup(re.sub(r"^export ", "", scene, flags=re.MULTILINE)),
         "colours": Markup(_colours((_STATIC / "play.css").read_text(encoding="utf-8"))),
@@ -62,7 +62,7 @@ def player(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Markup]:
 
 
 def _colours(sheet: str) -> str:
-    """The live page's colours, for the player alone: the rest of the page has names of its own."""
+    """The live page's colours, limited to the player, because the report uses other names."""
     declared = "\n".join(line for line in sheet.splitlines() if line.startswith("@property"))
     values = sheet.partition(":root {")[2].partition("}")[0]
     return f"{declared}\n.stage {{{values}}}"
@@ -142,7 +142,7 @@ def _capture_set(scenario: Scenario) -> list[float]:
 
 
 def _words(trajectory: Trajectory, episode: WorstEpisode, period: float) -> str:
-    """How an episode ended and why it is shown."""
+    """The outcome of an episode and why it is shown, in words."""
     events = trajectory.events
     ended = f"{OUTCOME_WORDS[trajectory.outcome]} after {shown_number(trajectory.length * period, 1, ' s')}"
     nearness = events.pursuer_clearance if episode.hazard == "capture" else events.obstacle_clearance
@@ -154,7 +154,7 @@ def _words(trajectory: Trajectory, episode: WorstEpisode, period: float) -> str:
 
 
 def _steps(values: Float[np.ndarray, "n"]) -> list[Any]:
-    """Least value, step, and the values as 16-bit whole numbers of steps, little-endian, in base 64."""
+    """Least value, step, and the values as numbers of steps: 16 bit, little-endian, in base 64."""
     low, high = float(np.min(values, initial=np.inf)), float(np.max(values, initial=-np.inf))
     if not len(values):
         return [0.0, 0.0, ""]

@@ -1,4 +1,4 @@
-"""The report of one or several runs: one HTML file that needs nothing else."""
+"""The report of one or several runs, as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -51,12 +51,16 @@ def write_report(
 ) -> Path:
     """Draw the figures of these runs and write the report.
 
-    **Arguments:** `runs` run folders, or `Run`s; several seeds of a shield are pooled, and its test scene and
-    capture are those of its first run that has one. `path` the HTML file; `figures` the folder for the
-    figures as PNG and PDF (`figures` beside `path` if not given); `command` what to type to run it again.
+    **Arguments:**
 
-    **Raises** `ValueError` without a run, `RunError` for a folder that holds none, `FolderInUseError` when
-    `path` lies in a run folder that someone else writes in.
+    - `runs`: run folders, or `Run`s; several seeds of a shield are pooled. The test scene and the capture of
+      a shield are those of its first run that has one
+    - `path`: the HTML file
+    - `figures`: the folder for the figures as PNG and PDF (default: `figures` beside `path`)
+    - `command`: the command line that writes the report, to be shown in it
+
+    **Raises** `ValueError` without a run, `RunError` for a folder without a run, `FolderInUseError` when
+    `path` is in a run folder that another process writes in.
     """
     if not runs:
         raise ValueError("a report needs at least one run")
@@ -131,20 +135,20 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
 
 
 def _pooled_evaluations(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, dict[str, Any]]:
-    """By shield, the evaluations of its runs as one, where there are any."""
+    """The pooled evaluations per shield."""
     found = {shield: [getattr(run, field) for run in group] for shield, group in groups.items()}
     measured = {shield: [one for one in many if one is not None] for shield, many in found.items()}
     return {shield: pooled_evaluation(many) for shield, many in measured.items() if many}
 
 
 def _reward(runs: Sequence[Run], folder: Path) -> str:
-    """The page's reward figure; beside it, the same for one column of a paper."""
+    """Draw the reward figure twice, for the page and for one column of a paper; returns the page's."""
     reward_figure(runs, folder / "reward-column", width=style.COLUMN)
     return embedded(reward_figure(runs, folder / "reward"))
 
 
 def _differences(runs: Sequence[Run]) -> list[tuple[str, list[str]]]:
-    """Scenario fields in which these runs differ, with their values: their figures are then of two worlds."""
+    """Scenario fields in which these runs differ, with their values; such runs are not comparable."""
     scenarios = [run.config["scenario"] for run in runs]
     fields = {name for scenario in scenarios for name in scenario if name != "name"}
     found = []

@@ -1,4 +1,4 @@
-"""The sections of a report that show episodes: their figures, and what the page says of them."""
+"""The sections of a report that show episodes: figures and texts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sidestep.views.trajectory_figures import trajectory_figure
 from sidestep.world import Scenario
 
 _MOST_REPLAYS = 4
-"""Episodes to replay per shield."""
+"""Number of replayed episodes per shield."""
 _CAUSE_WORDS = {
     "reversing": "the pursuer drove backwards, which the row takes for leaving",
     "head-on": "the pursuer came straight on, and no velocity satisfied the row",
@@ -33,7 +33,7 @@ _CAUSE_WORDS = {
 
 
 def first_of(groups: Mapping[str, Sequence[Run]], field: str) -> dict[str, tuple[Run, Any]]:
-    """By shield, the first run that has this field, and the field."""
+    """Per shield, the first run that has this field, and the field's value."""
     found = {}
     for shield, group in groups.items():
         for run in group:
@@ -49,7 +49,7 @@ def embedded(written: tuple[Path, Path]) -> str:
 
 
 def scene_section(scenario: Scenario, shield: str, scene: Trajectory, folder: Path) -> dict[str, Any]:
-    """The test scene behind one shield: its figure, how it ended and how close it was."""
+    """The test scene with one shield: figure, outcome and least clearances."""
     written = trajectory_figure(
         scenario, scene, folder / f"test-scene-{shield}", shield=shield, title="Paths, marked in seconds"
     )
@@ -78,7 +78,7 @@ def scene_section(scenario: Scenario, shield: str, scene: Trajectory, folder: Pa
 def clearance_section(
     groups: Mapping[str, Sequence[Run]], scenario: Scenario, folder: Path
 ) -> dict[str, Any] | None:
-    """Histograms of the episodes after training, or of those in training where a run has no others."""
+    """Clearance histograms of the evaluation's episodes, or of the training's if there is no evaluation."""
     surveyed = all(run.survey is not None for group in groups.values() for run in group)
 
     def of(run: Run, hazard: str) -> np.ndarray:
@@ -112,7 +112,7 @@ def clearance_section(
 def map_section(
     groups: Mapping[str, Sequence[Run]], scenario: Scenario, folder: Path
 ) -> dict[str, Any] | None:
-    """Where each shield stepped in, over the episodes after training; None without a shield that did."""
+    """Maps of interventions over the evaluation's episodes; None if there were no interventions."""
     maps: dict[str, InterventionMap] = {}
     episodes: dict[str, int] = {}
     for shield, group in groups.items():
@@ -120,7 +120,7 @@ def map_section(
             if run.survey is None or run.survey.evaluation.map is None:
                 continue
             found = run.survey.evaluation.map
-            # Runs with other capture distances have maps of another region.
+            # The maps of runs with other capture distances cover another region.
             if shield not in maps:
                 maps[shield] = found
             elif maps[shield].reach == found.reach:
@@ -141,7 +141,7 @@ def map_section(
 
 
 def replay_section(groups: Mapping[str, Sequence[Run]]) -> dict[str, Any] | None:
-    """The worst episodes of each shield, by turns from its runs, for the player."""
+    """The worst episodes of each shield, alternately from its runs, for the player."""
     shown: list[dict[str, Any]] = []
     for shield, group in groups.items():
         turns = zip_longest(*[run.survey.worst if run.survey else () for run in group])
@@ -159,7 +159,7 @@ def replay_section(groups: Mapping[str, Sequence[Run]]) -> dict[str, Any] | None
 
 
 def capture_section(groups: Mapping[str, Sequence[Run]], folder: Path) -> dict[str, Any] | None:
-    """One capture under the paper's shield, and how all of its captures came about, if known."""
+    """One capture under the paper's shield, and the causes of all its captures, if known."""
     found = first_of({shield: group for shield, group in groups.items() if shield == "paper"}, "capture")
     if not found:
         return None

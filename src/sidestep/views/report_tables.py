@@ -1,4 +1,4 @@
-"""The numbers of a report: a card for each shield, and the paper's figures beside ours."""
+"""The tables of a report: a card per shield, and a comparison with the paper's results."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from sidestep.views.training_figures import PAPER_CONVERGED, safety_rows
 
 
 def percent(value: float | int | None, digits: int = 1) -> str:
-    """A share in percent; a dash where there is none."""
+    """A share in per cent; a dash for None."""
     return "–" if value is None else f"{100 * value:.{digits}f}\u00a0%"
 
 
 def convergence(group: Sequence[Run]) -> str:
-    """Where a shield's runs first converged, and from where they stayed so, in words."""
+    """The episodes at which a shield's runs first converged, and from which they stayed converged, in
+    words."""
     returns = [[float(e["return"]) for e in run.metrics] for run in group]
     firsts, stays = [converged_episode(r) for r in returns], [stays_converged_from(r) for r in returns]
     if len(group) > 1:
@@ -37,7 +38,7 @@ def convergence(group: Sequence[Run]) -> str:
 
 
 def card(shield: str, group: Sequence[Run], scenes: Mapping[str, tuple[Run, Trajectory]]) -> dict[str, Any]:
-    """How safe the training behind one shield was, where it converged and how its test scene ended."""
+    """Safety of the training with one shield, its convergence, and the outcome of its test scene."""
     row = next(row for row in safety_rows(group) if row["shield"] == shield)
     scene = scenes.get(shield)
     return {
@@ -60,7 +61,7 @@ def comparison(
     scenes: Mapping[str, Trajectory],
     untrained_scenes: Mapping[str, Trajectory],
 ) -> dict[str, Any]:
-    """The paper's figures beside ours: names of the columns, and rows of cells."""
+    """The comparison with the paper's results: names of the columns, and rows of cells."""
     safety = {row["shield"]: row for row in safety_rows([run for group in groups.values() for run in group])}
     paper = safety.pop(None)
     rows: list[tuple[str, list[str]]] = [

@@ -1,4 +1,4 @@
-"""A run folder as the views see it: whatever of it exists."""
+"""Read a run folder for figures and reports, complete or not."""
 
 from __future__ import annotations
 
@@ -25,11 +25,10 @@ UNTRAINED_SCENE_FILE = "test_scene_untrained.npz"
 class Run:
     """One training run.
 
-    **Attributes:** `config`, `metrics`, `summary` as on disk; `evaluation` what `Evaluation.to_dict` gave
-    after training; `scene` the paper's test scene with the trained policy; `capture` an episode that the
-    shield lost, if one is shown; `untrained_evaluation` and `untrained_scene` the same with the untrained
-    policy that heads straight for the target; `survey` the evaluation episode by episode. All but `config`
-    and `metrics` may be missing.
+    **Attributes:** `config`, `metrics`, `summary` as on disk; `evaluation` after training, as
+    `Evaluation.to_dict`; `scene` the paper's test scene with the trained policy; `capture` an example of a
+    capture; `untrained_evaluation` and `untrained_scene` with the untrained policy `goal-seeking`; `survey`
+    of the evaluation. All but `config` and `metrics` may be missing.
     """
 
     config: Mapping[str, Any]
@@ -45,7 +44,7 @@ class Run:
 
     @property
     def shield(self) -> str:
-        """Name of the shield it was trained under."""
+        """Name of the shield of the training."""
         return str(self.config.get("shield", "unknown"))
 
     @property
@@ -55,12 +54,12 @@ class Run:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario it was trained in."""
+        """The scenario of the training."""
         return load_scenario("paper", **self.config["scenario"])
 
 
 def load_run(folder: str | Path) -> Run:
-    """Read a run folder. A run that is still going, or was stopped, gets its summary from its metrics.
+    """Read a run folder. The summary of a running or stopped run is computed from its metrics.
 
     **Raises** `RunError` when `folder` holds no run.
     """

@@ -1,4 +1,4 @@
-"""Drawing robots, paths and barriers into a scene (metres, equal aspect)."""
+"""Draw robots, paths and barriers in a scene (m, equal aspect)."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from sidestep.world import Scenario, World
 _MOST_MARKS = 8
 _LABEL_HALO = [withStroke(linewidth=1.8, foreground="white")]
 _RANKS = {style.EVADER: 0, style.PURSUER: 1}
-"""Whose time labels go first where there is little room."""
+"""Order in which time labels are placed; the first ones have priority."""
 CAPTURE_SET_LOOK: dict[str, Any] = {"color": style.PURSUER, "linewidth": 1.4, "linestyle": (0, (2.5, 2))}
-"""How the outline of the capture set K is drawn in every view."""
+"""Look of the outline of the capture set K in all views."""
 LEVELS = (0.1, 0.2, 0.3)
-"""Levels of the barrier (m) that are drawn beside its level 0."""
+"""Levels of the barrier (m) that are drawn besides level 0."""
 LEVEL_COLOUR = "#8F8F8F"
 _ROBOT = 0.07
-"""Length of a drawn robot, m; sizes do not enter the problem."""
+"""Length (m) of a drawn robot; it has no meaning in the problem."""
 
 
 def correction_colours() -> Colormap:
-    """Pale for small corrections, dark for large ones; apart from the path's blue at both ends."""
+    """Pale for small corrections, dark for large ones; distinct from the path's blue."""
     whole = matplotlib.colormaps["inferno_r"]
     return LinearSegmentedColormap.from_list("correction", whole(np.linspace(0.12, 0.72, 128)))
 
 
 def guarded(scenario: Scenario) -> Scenario:
-    """The problem whose barriers are drawn: with robots of one's own the one that stands for theirs, of the
-    evader's control point and the differential drive that covers the pursuer."""
+    """The scenario whose barriers are drawn. For custom robots it is that of the evader's control point and
+    of the differential drive that covers the pursuer."""
     model = scenario.pursuer_model
     if model is not None and model.covering(scenario) is None:
         return of_control_point(dataclasses.replace(scenario, pursuer_model=None))
@@ -52,8 +52,8 @@ def guarded(scenario: Scenario) -> Scenario:
 
 
 def drawn_half_axle(scenario: Scenario) -> float:
-    """Half the axle (m) of a pursuer as it is drawn. One of one's own has wings or whatever: its half axle is
-    only what strategies answer for, and it is drawn within its capture circle."""
+    """Half axle (m) of a drawn pursuer. A custom pursuer may have no axle: the scenario's half axle is only
+    for its strategies, and it is drawn within its capture circle."""
     own = scenario.pursuer_model is not None
     return 0.6 * float(scenario.capture_distance) if own else float(scenario.pursuer_half_axle)
 
@@ -61,8 +61,8 @@ def drawn_half_axle(scenario: Scenario) -> float:
 def capture_set_outline(scenario: Scenario, points: int = 181) -> Float[np.ndarray, "points 2"]:
     """Outline of the capture set K in the pursuer's frame, m, closed.
 
-    The convex hull of the disc of radius l and the points (+-l/rho, 0); the disc alone when the evader is
-    at least as fast.
+    The convex hull of the disc of radius l and the points (+-l/rho, 0); the disc if the evader is at least as
+    fast as the pursuer.
     """
     scenario = guarded(scenario)
     radius, usable = float(scenario.capture_distance), float(scenario.usable_angle)
@@ -73,12 +73,12 @@ def capture_set_outline(scenario: Scenario, points: int = 181) -> Float[np.ndarr
 
 
 def capture_set_words(scenario: Scenario) -> str:
-    """How a key calls the outline that every view draws, that of `capture_set_outline`."""
+    """The legend's name of `capture_set_outline`."""
     return "capture set K" if scenario.evader_model is None else "capture set K of the control point"
 
 
 def to_world(points: Float[np.ndarray, "n 2"], pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 2"]:
-    """Points of a pursuer's frame in the world."""
+    """Points of a pursuer's frame in world coordinates."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     return pose[:2] + points @ np.array([[cosine, sine], [-sine, cosine]])
 
@@ -97,10 +97,8 @@ def world_at(trajectory: Trajectory, period: int) -> World:
 
 
 def tightest_period(trajectory: Trajectory) -> int:
-    """The control period at whose beginning the evader was nearest to pursuers and obstacles together.
-
-    That is where the least barriers towards either sum up to least; the end, if the evader was lost there.
-    """
+    """The control period at whose beginning the sum of the least barriers towards pursuers and towards
+    obstacles is smallest; the last one if the evader was lost."""
     if trajectory.outcome in ("captured", "collided"):
         return trajectory.length
     values = np.nan_to_num(np.asarray(trajectory.barriers), neginf=0.0)
@@ -114,7 +112,7 @@ def _at(point: Float[np.ndarray, "..."]) -> tuple[float, float]:
 
 
 def set_limits(axes: Axes, points: Float[np.ndarray, "n 2"], margin: float) -> None:
-    """Equal scales, everything in view, `margin` metres around it."""
+    """Set equal scales and limits that contain all points with `margin` (m) around them."""
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(low[0], high[0])
@@ -124,7 +122,7 @@ def set_limits(axes: Axes, points: Float[np.ndarray, "n 2"], margin: float) -> N
 def draw_pursuer(
     axes: Axes, pose: Float[np.ndarray, "3"], *, alpha: float = 1.0, size: float = _ROBOT
 ) -> None:
-    """An arrowhead that points where the pursuer heads."""
+    """An arrowhead along the pursuer's heading."""
     shape = size * np.array([[0.75, 0.0], [-0.5, 0.5], [-0.25, 0.0], [-0.5, -0.5]])
     axes.add_patch(
         Polygon(
@@ -142,7 +140,7 @@ def draw_capture_set(axes: Axes, scenario: Scenario, pose: Float[np.ndarray, "3"
     """The capture circle and the capture set K around a pursuer."""
     style.draw_disc(axes, _at(pose[:2]), float(scenario.capture_distance), style.PURSUER, alpha=0.12)
     outline = to_world(capture_set_outline(scenario), pose)
-    # Over the level h = 0, which has the same place around a pursuer for the shields that keep K.
+    # Above the level h = 0, which coincides with it for shields that keep K.
     axes.plot(*outline.T, **CAPTURE_SET_LOOK, zorder=3)
 
 
@@ -168,7 +166,7 @@ def draw_obstacles(
 
 
 def draw_target(axes: Axes, scenario: Scenario, target: Float[np.ndarray, "2"]) -> None:
-    """The target and the distance that counts as reached."""
+    """The target and the reach distance."""
     reach = float(scenario.reach_distance)
     axes.add_patch(Circle(_at(target), reach, facecolor=style.TARGET, alpha=0.25, linewidth=0, zorder=2))
     axes.plot(*target, "*", zorder=7, **style.mark(style.TARGET, 9, width=0.6))
@@ -186,11 +184,11 @@ def draw_time_marks(
 ) -> None:
     """The time in seconds, and a dot, at these control periods of a path; `side` -1 prefers its right.
 
-    Labels that find no room are left out when the figure is saved, see `place_labels`.
+    Labels without room are left out when the figure is saved, see `place_labels`.
     """
     span = np.ptp(np.asarray([axes.get_xlim(), axes.get_ylim()]), axis=1).max()
     place = axes.get_subplotspec()
-    # Labels keep their size when scenes stand side by side, so fewer have room.
+    # Labels keep their size in small scenes, so fewer fit.
     room = 0.022 * span * (1 if place is None else place.get_gridspec().ncols)
     last = None
     for mark in periods:
@@ -198,7 +196,7 @@ def draw_time_marks(
             continue
         if dots:
             axes.plot(*path[mark], "o", zorder=8, **style.mark("white", 3.2, colour, 0.9))
-        # Where a robot stands still its labels would pile up.
+        # Labels of a robot that stands still would overlap.
         if last is not None and np.hypot(*(path[mark] - last)) < room:
             continue
         last = path[mark]
@@ -217,7 +215,7 @@ def draw_time_marks(
 
 
 def draw_evader_path(axes: Axes, trajectory: Trajectory, norm: Normalize) -> LineCollection:
-    """The evader's path; where the shield stepped in, thick and coloured by the size of the correction."""
+    """The evader's path; thick and coloured by the size of the correction where the shield intervened."""
     path = np.asarray(trajectory.worlds.evader)
     correction = np.asarray(trajectory.intervention)
     segments = np.stack([path[:-1], path[1:]], axis=1)

@@ -1,4 +1,4 @@
-"""The pictures of an episode in motion: what stays, drawn once, and what moves, drawn on top of it."""
+"""The pictures of an animation: static parts are drawn once, moving parts on top of them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from sidestep.safety import PURSUIT_SHIELDS
 from sidestep.views import scene, style
 from sidestep.views.motion import Instant, Motion
 from sidestep.views.moving_panel import NOMINAL_DASHES, MovingPanel
+from sidestep.views.trails import Trails
 from sidestep.views.trajectory_figures import (
     ANSWERS,
     correction_norm,
@@ -30,27 +31,24 @@ from sidestep.views.trajectory_figures import (
     scene_margin,
 )
 from sidestep.views.video_files import VideoError
-from sidestep.views.ways import Ways
 from sidestep.world import Scenario
 
 _INCHES = (8.0, 4.5)
 _WORLD, _SEEN = (0.42, 1.92, 4.88, 2.06), (5.74, 1.92, 2.06, 2.06)
 _BARRIERS, _CORRECTIONS = (0.42, 0.82, 7.38, 0.42), (0.42, 0.36, 7.38, 0.27)
 _TOP = 4.26
-"""Places of the axes (left, bottom, width, height) and height of the first line, in inches. They never
-change, so nothing jitters."""
+"""Positions of the axes (left, bottom, width, height) and height of the first line, in inches. They are
+fixed, so that nothing jitters."""
 _TICKS = (0.0, 0.02, 0.1, 0.5, 1.0, 2.0, 4.0)
 _WIDEST = 3.2
-"""The pursuer's frame shows at most so many times the reach of its capture set."""
+"""Largest half width of the pursuer's frame, in units of the reach of its capture set."""
 
 
 @final
 class Stage:
     """The pictures of an animation, at any time of the episode and in any order.
 
-    What never changes is drawn once; each picture is that, with what moves drawn on top of it.
-
-    **Arguments:** as for `animate`; `speed` is only told.
+    **Arguments:** as for `animate`; `speed` is only displayed.
     """
 
     def __init__(
@@ -68,20 +66,20 @@ class Stage:
             raise VideoError("the episode has no control period to show")
         self.motion = Motion(scenario, trajectory)
         self._trajectory, self._status = trajectory, np.asarray(trajectory.status)
-        self._ways = Ways(scenario, trajectory, self.motion)
+        self._trails = Trails(scenario, trajectory, self.motion)
         self._speed = "" if speed == 1.0 else f" (× {speed:g})"
         words = title if title is not None else style.shield_words(shield) if shield else ""
         self._words = words[:1].upper() + words[1:]
         start = self.motion.at(0.0)
         with style.house_style():
-            # An MP4 needs even numbers of pixels.
+            # MP4 requires even numbers of pixels.
             pixels = 2 * np.ceil(np.array(_INCHES) * width / _INCHES[0] / 2.0)
             dpi = width / _INCHES[0]
             self._figure = Figure(figsize=tuple(pixels / dpi), dpi=dpi)
             self._canvas = FigureCanvasAgg(self._figure)
             self.world, self.seen = self._axes(_WORLD), self._axes(_SEEN)
             _set_up_world(self.world, scenario, trajectory)
-            _set_up_seen(self.seen, scenario, self._ways.distances)
+            _set_up_seen(self.seen, scenario, self._trails.distances)
             look = {"pursuit": shield in PURSUIT_SHIELDS, "levels": levels}
             others = len(start.poses) + len(start.obstacles)
             self._panels = (
@@ -103,7 +101,7 @@ class Stage:
         self._labelled: tuple[list[str], Any] = ([], None)
 
     def _write_words(self) -> None:
-        """Titles that stay, and empty texts for what is said later."""
+        """Static titles, and empty texts to be set later."""
         self._text(_WORLD[0], _WORLD[1] + _WORLD[3] + 0.05, "The world, m", weight="bold", size=8.0)
         for place, words in (
             (_BARRIERS, "Barriers h: how far from capture and collision, m (√ scale)"),
@@ -140,8 +138,8 @@ class Stage:
             Patch(facecolor=scene.correction_colours()(0.6), label="shield corrects"),
         ]
         if levels:
-            told = f"h = {', '.join(f'{level:g}' for level in levels)} m"
-            handles.insert(6, Line2D([], [], color=scene.LEVEL_COLOUR, linewidth=0.6, label=told))
+            label = f"h = {', '.join(f'{level:g}' for level in levels)} m"
+            handles.insert(6, Line2D([], [], color=scene.LEVEL_COLOUR, linewidth=0.6, label=label))
         if obstacles:
             handles.insert(4, Patch(facecolor=style.OBSTACLE, alpha=0.35, label="collision distance"))
         self._figure.legend(
@@ -156,12 +154,12 @@ class Stage:
         for axes, artist in self._moving:
             axes.draw_artist(artist)
         self._clock.draw(self._canvas.get_renderer())
-        # Much faster than to copy three bytes of every four.
+        # Much faster than copying three of every four bytes.
         drawn = Image.fromarray(np.asarray(self._canvas.buffer_rgba()))
         return np.asarray(drawn.convert("RGB"))
 
     def _with_labels(self) -> Any:
-        """What never changes, with the words that seldom change: text is slow to draw."""
+        """The static background with the texts that seldom change, because text is slow to draw."""
         words = [label.get_text() for label in self._labels]
         if words != self._labelled[0]:
             self._canvas.restore_region(self._still)
@@ -172,13 +170,13 @@ class Stage:
 
     def _place(self, time: float, end: bool) -> None:
         now, outcome = self.motion.at(time), self._trajectory.outcome if end else None
-        pursuer = self._ways.viewer(time)
+        pursuer = self._trails.viewer(time)
         pose, (world, seen) = now.poses[pursuer], self._panels
         world.show(now, outcome)
-        world.show_trails(*self._ways.in_world(now))
+        world.show_trails(*self._trails.in_world(now))
         from_it = now.seen_from(pose)
         seen.show(from_it, outcome)
-        seen.show_trails(*self._ways.seen_by(pursuer, from_it))
+        seen.show_trails(*self._trails.seen_by(pursuer, from_it))
         self._say(now, pursuer, end)
         for _, (veil, line) in self._veils:
             cast(Rectangle, veil).set_x(time)
@@ -193,20 +191,20 @@ class Stage:
         colour, words = ANSWERS[int(self._status[now.period])]
         self._answer.set_text(f"shield: {words}")
         self._answer.set_color(style.INK if words == "unchanged" else colour)
-        told, colour = self._words, style.INK
+        heading, colour = self._words, style.INK
         if end:
             outcome = self._trajectory.outcome
             colour = style.OUTCOME_COLOURS.get(outcome, style.INK)
-            told = f"{style.OUTCOME_WORDS[outcome]} after {self.motion.duration:.2f} s"
-            told = f"{self._words}: {told}" if self._words else told[:1].upper() + told[1:]
-        self._heading.set_text(told)
+            heading = f"{style.OUTCOME_WORDS[outcome]} after {self.motion.duration:.2f} s"
+            heading = f"{self._words}: {heading}" if self._words else heading[:1].upper() + heading[1:]
+        self._heading.set_text(heading)
         self._heading.set_color(colour)
 
 
 def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
-    """Limits that hold everything that ever moves, at equal scales, filling the panel."""
+    """Set limits that contain all motion of the episode, at equal scales, filling the panel."""
     low, high = scene_extent(trajectory)
-    # On the live page there is another target after each that is reached.
+    # On the live page a new target follows each that is reached.
     targets = np.asarray(trajectory.worlds.target)
     low = np.minimum(low, targets.min(axis=0)) - scene_margin(scenario)
     high = np.maximum(high, targets.max(axis=0)) + scene_margin(scenario)
@@ -217,7 +215,7 @@ def _set_up_world(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     _round_ticks(axes, 8, 6)
     side = float(scenario.arena_side)
-    # Without a corner of it in view, it would be a line that says nothing.
+    # Drawn only if a corner is in view; otherwise it would be a meaningless line.
     if np.all(np.abs(middle) + half > side / 2):
         axes.add_patch(
             Rectangle(
@@ -241,7 +239,7 @@ def _set_up_seen(axes: Axes, scenario: Scenario, distances: Float[np.ndarray, "n
 
 
 def _round_ticks(axes: Axes, across: int, up: int) -> None:
-    """Few digits, for which there is room at the left."""
+    """Ticks with few digits, which fit at the left."""
     for axis, most in ((axes.xaxis, across), (axes.yaxis, up)):
         axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
     style.light_grid(axes)
@@ -250,7 +248,7 @@ def _round_ticks(axes: Axes, across: int, up: int) -> None:
 def _draw_strips(
     barriers: Axes, corrections: Axes, scenario: Scenario, trajectory: Trajectory
 ) -> list[tuple[Axes, tuple[Artist, Artist]]]:
-    """The shield's whole trace, and over each strip a veil over what is still to come and a time mark."""
+    """The shield's trace over the episode; on each strip a veil that covers the future, and a time mark."""
     draw_barriers(barriers, scenario, trajectory)
     draw_corrections(corrections, scenario, trajectory, correction_norm(scenario))
     duration, veils = trajectory.length * float(scenario.control_period), []
@@ -267,7 +265,7 @@ def _draw_strips(
         )
         veils.append((strip, (veil, line)))
     barriers.tick_params(labelbottom=False)
-    # Fewer than in a figure: the strip is low. On the scale of square roots they must lie apart.
+    # Fewer ticks than in a figure, because the strip is low; spaced for the square-root scale.
     ticks, room = [_TICKS[0]], 0.18 * np.sqrt(barriers.get_ylim()[1])
     for tick in _TICKS[1:]:
         if tick <= barriers.get_ylim()[1] and np.sqrt(tick) >= np.sqrt(ticks[-1]) + room:

@@ -1,4 +1,4 @@
-"""One look for all figures: fonts, sizes, and colours that colour-blind readers can tell apart."""
+"""The style of all figures: fonts, sizes, and colours that colour-blind readers can distinguish."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SHIELD_WORDS = {
     "game": "game shield",
     "joint": "joint shield",
 }
-# Told apart without colour too: in print, and where two colours are equally light.
+# Distinguishable without colour too, in print and where two colours are equally light.
 _SHIELD_DASHES: dict[str, Any] = {
     "none": (0, (1, 1.2)),
     "paper": (0, (4, 1.5)),
@@ -94,22 +94,23 @@ _SETTINGS: dict[str, Any] = {
 
 
 def shield_colour(name: str, position: int = 0) -> str:
-    """The colour of a shield everywhere; one that is not ours gets one of the others by its position."""
+    """The colour of a shield in all figures; for a custom shield one of the other colours, by its
+    position."""
     return _SHIELD_COLOURS.get(name, _OTHERS[position % len(_OTHERS)])
 
 
 def shield_dashes(name: str) -> Any:
-    """The line style of a shield everywhere; solid for `joint` and for one that is not ours."""
+    """The line style of a shield in all figures; solid for `joint` and for custom shields."""
     return _SHIELD_DASHES.get(name, "solid")
 
 
 def shield_words(name: str) -> str:
-    """How captions call a shield."""
+    """The name of a shield in captions."""
     return _SHIELD_WORDS.get(name, f"{name} shield")
 
 
 def mark(colour: str, size: float | int, edge: str = "white", width: float = 0.8) -> dict[str, Any]:
-    """The look of a single mark with an edge, for `Axes.plot` and `Line2D`; size and width in points."""
+    """Arguments of `Axes.plot` and `Line2D` for a single mark with an edge; size and width in points."""
     return {"color": colour, "ms": size, "mec": edge, "mew": width, "ls": "none"}
 
 
@@ -126,7 +127,7 @@ def draw_disc(
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Figures drawn in here look alike, whatever the user's matplotlib is set to."""
+    """Figures drawn in this context use the common style, independent of the user's matplotlib settings."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_SETTINGS)  # pyright: ignore[reportCallIssue, reportArgumentType]
@@ -134,21 +135,21 @@ def house_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure of this size in inches that no window system and no global state knows of."""
+    """A figure of this size in inches, without a window and without global state."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def light_grid(axes: Axes, axis: Any = "both") -> None:
-    """Hairlines that guide the eye and no more."""
+    """A faint grid."""
     axes.grid(True, axis=axis, color="#E6E6E6", linewidth=0.6)
 
 
 def panel_titles(axes: Sequence[Axes], titles: Sequence[str], *, in_caption: bool = False) -> None:
-    """Titles with the letters a, b, ... that captions refer to; no letter for a single panel.
+    """Titles with letters a, b, ... for references; no letter for a single panel.
 
-    With `in_caption` the PDF, which is for papers, keeps the letters alone: the words are for its caption.
+    With `in_caption` the PDF, which is for papers, has the letters only: the titles belong in its caption.
     """
     for index, (one, title) in enumerate(zip(axes, titles, strict=True)):
         text = one.set_title(title if len(axes) == 1 else f"{chr(ord('a') + index)}   {title}")
@@ -164,8 +165,9 @@ def figure_files(path: str | Path) -> tuple[Path, Path]:
 def save(figure: Figure, path: str | Path) -> tuple[Path, Path]:
     """Write the figure as PNG and as PDF beside it; the suffix of `path`, if any, is replaced.
 
-    The same figure gives the same bytes: no dates inside. A PNG is made coarser until it stays below 300 kB.
-    The PDF drops into a two-column paper: fonts embedded as TrueType, titles that its caption gives left out.
+    The same figure gives the same bytes, without dates. The PNG's resolution is lowered until it is below
+    300 kB. The PDF is for a two-column paper: fonts are embedded as TrueType, and titles marked `in_caption`
+    are left out.
     """
     png, pdf = figure_files(path)
     content = b""

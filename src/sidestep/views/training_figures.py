@@ -1,4 +1,4 @@
-"""Figures of a training: returns and outcomes over episodes, and how many episodes were safe."""
+"""Figures of trainings: returns and outcomes over episodes, and numbers of safe episodes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PAPER_CONVERGED = 80
 PAPER_EPISODES = 200
 _MANY_RUNS = 6
 _BESIDE = -0.19
-"""Where a panel's letter stands in a column, in widths of the axes: above their labels, beside the legend."""
+"""Horizontal position of a panel's letter in a narrow figure, in widths of the axes."""
 _BAND, _HIGHEST = 0.32, 1000.0
 """Half the height of a run's band of returns, in rows, and the return at its top."""
 
@@ -33,16 +33,16 @@ _BAND, _HIGHEST = 0.32, 1000.0
 def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = style.WIDTH) -> tuple[Path, Path]:
     """Returns over training episodes: above as means, below one by one, with how every episode ended.
 
-    a: mean return of the last 20 episodes; over several seeds the interquartile mean of it (thick) with each
-    seed (thin) and their range. A filled diamond marks where a run first converged (mean of 20 at least 940),
-    a hollow one from where it stayed so to the end. b: the return of each episode, a row per run, clipped to
-    0 to 1000, and by marker how it ended. Writes PNG and PDF, `width` inches wide.
+    a: mean return of the last 20 episodes; for several seeds its interquartile mean (thick), each seed (thin)
+    and their range. A filled diamond marks a run's first convergence (mean of 20 at least 940), a hollow one
+    the episode from which it stayed converged. b: the return of each episode, a row per run, clipped to
+    [0, 1000], with markers for the outcome. Writes PNG and PDF, `width` inches wide.
     """
     groups = by_shield(runs)
     rows = [run for group in groups.values() for run in group]
     with style.house_style():
         raster_height = _row_height(rows) * max(len(rows), 1) + 0.25
-        # In a column there is room for the letters of the panels alone.
+        # A narrow figure has room for the panels' letters only.
         narrow = width < style.WIDTH
         figure = style.new_figure(width, (2.5 if narrow else 2.9) + raster_height)
         top, raster = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, raster_height])
@@ -59,7 +59,7 @@ def reward_figure(runs: Sequence[Run], path: str | Path, *, width: float = style
 
 
 def _row_height(runs: Sequence[Run]) -> float:
-    """Inches for the episodes of one run."""
+    """Height (inches) of the row of one run."""
     return 0.4 if len(runs) <= _MANY_RUNS else 0.24
 
 
@@ -117,7 +117,7 @@ def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
             ha="right",
         )
     axes.set_ylabel("mean return")
-    # The words at the foot stand below every curve.
+    # The texts at the bottom are below every curve.
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0) - (90.0 if longest > PAPER_CONVERGED else 0.0), max(high, 1050.0))
     axes.set_xlim(0, longest + 1)
@@ -128,7 +128,7 @@ def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
         Line2D([], [], **look, color=face, label=word)
         for face, word in zip((style.INK, "white"), words, strict=True)
     ]
-    # Above the axes, where no curve can run.
+    # Above the axes, where no curve is.
     most = 2 if narrow else 3
     rows = -(-(len(handles) + 2) // most)
     axes.set_title(
@@ -141,7 +141,7 @@ def _finish_returns(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
 
 
 def _draw_episodes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
-    """Every episode's return, in a band of its own per run, by markers for how it ended."""
+    """Every episode's return, in one band per run, with markers for the outcome."""
     many = len(runs) > _MANY_RUNS
     for row, run in enumerate(runs):
         places = row + _BAND * (1.0 - 2.0 * np.clip(_returns(run) / _HIGHEST, 0.0, 1.0))
@@ -182,7 +182,7 @@ def _draw_episodes(axes: Axes, runs: Sequence[Run], *, narrow: bool) -> None:
 
 
 def safety_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """The paper's Table I, its own column first: episodes, safe episodes, ratio and its 95 % bounds.
+    """The paper's Table I, the paper's column first: episodes, safe episodes, ratio and its 95 % bounds.
 
     Several seeds of a shield are pooled.
     """
@@ -222,7 +222,7 @@ def safety_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def safety_table(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
-    """The number of safe episodes in training as a table, the paper's beside ours. Writes PNG and PDF."""
+    """The numbers of safe episodes in training as a table, with the paper's. Writes PNG and PDF."""
     columns = safety_rows(runs)
 
     def share(value: float | None) -> str:
@@ -262,10 +262,10 @@ def outcome_figure(
 ) -> tuple[Path, Path]:
     """Shares of episodes captured, collided, timed out and reached per shield, with 95 % Wilson intervals.
 
-    Filled: the learned policy; hollow below it: the one that heads straight for the target, if given. What
-    differs between the two is the policy's work, what differs between rows the shield's.
+    Filled: the learned policy; hollow: the policy `goal-seeking`, if given. The difference between the two is
+    due to the policy, the difference between rows due to the shield.
 
-    **Arguments:** `evaluations`, `untrained` what `Evaluation.to_dict` gives, by shield. Writes PNG and PDF.
+    **Arguments:** `evaluations`, `untrained` as of `Evaluation.to_dict`, by shield. Writes PNG and PDF.
     """
     panels = (
         ("captured", "Captured"),
@@ -311,7 +311,7 @@ def outcome_figure(
 def _draw_share(
     axes: Axes, report: Mapping[str, Any], outcome: str, place: float, colour: str, face: str
 ) -> float:
-    """One share (%) with its interval and count; the upper end of the interval."""
+    """Draw one share (%) with its interval and count; returns the upper end of the interval."""
     rate, low, high = (100 * report[f"{outcome}_rate{end}"] for end in ("", "_low", "_high"))
     axes.plot([low, high], [place, place], color=colour, linewidth=2.2, alpha=0.5)
     axes.plot(rate, place, "o", color=colour, markerfacecolor=face, markersize=5)

@@ -1,4 +1,4 @@
-"""Figures of one episode: paths with time marks, where the shield stepped in, barriers over time."""
+"""Figures of one episode: paths with time marks, interventions, barriers over time."""
 
 from __future__ import annotations
 
@@ -55,12 +55,11 @@ def trajectory_figure(
     title: str | None = None,
     moment: float | None = None,
 ) -> tuple[Path, Path]:
-    """The paths of evader, pursuers and obstacles; below them the trace of the shield over time: barriers,
-    corrections, and its status in every control period.
+    """The paths of evader, pursuers and obstacles; below them the shield's trace over time: barriers,
+    corrections and status.
 
-    **Arguments:** `shield` the name of the shield used, for words and for which barrier's level sets are
-    drawn; `moment` the time (s) at which pursuers' capture sets, obstacles and level sets are drawn: when it
-    was tightest between pursuers and obstacles if not given.
+    **Arguments:** `shield` its name, for texts and for the barrier whose level sets are drawn; `moment` the
+    time (s) at which capture sets, obstacles and level sets are drawn (default: see `tightest_period`).
 
     Writes PNG and PDF; returns their paths.
     """
@@ -70,7 +69,7 @@ def trajectory_figure(
     with style.house_style():
         low, high = scene_limits(scenario, trajectory, shield=shield, period=period)
         spans = high - low
-        # As high as the scene needs at full width, within reason.
+        # The height that the scene needs at full width, within bounds.
         scene_height = float(np.clip((style.WIDTH - 0.6) * spans[1] / spans[0], 1.8, 5.2))
         figure = style.new_figure(style.WIDTH, scene_height + 3.75)
         scene, key, barriers, corrections, answers = figure.subplots(
@@ -117,7 +116,7 @@ def scenes_figure(
             scene_limits(scenario, trajectory, shield=shield) for shield, trajectory in trajectories.items()
         )
         spans = high - low
-        # Two columns from three scenes on: one below the other they would not fit a page.
+        # Two columns for three or more scenes, to fit a page.
         count, columns = len(trajectories), 1 if len(trajectories) <= 2 else 2
         rows = -(-count // columns)
         height = float(np.clip((style.WIDTH - 1.3) / columns * spans[1] / spans[0], 1.5, 4.0))
@@ -129,7 +128,7 @@ def scenes_figure(
         for one, (shield, trajectory) in zip(axes, trajectories.items(), strict=True):
             draw_scene(one, scenario, trajectory, norm, shield=shield, limits=(low, high))
             duration = trajectory.length * float(scenario.control_period)
-            # Short, for half a page's width.
+            # Short titles for half a page's width.
             words = f"{style.shield_words(shield)}: {trajectory.outcome.replace('_', ' ')}, {duration:.2f} s"
             titles.append(words[:1].upper() + words[1:])
         for index, one in enumerate(axes):
@@ -150,18 +149,18 @@ def scenes_figure(
 
 
 def correction_norm(scenario: Scenario) -> Normalize:
-    """From nothing to a full reversal, so that colours mean the same in every figure."""
+    """From 0 to 2 v_e (a full reversal), so that colours are the same in every figure."""
     return Normalize(0.0, 2.0 * float(scenario.evader_speed))
 
 
 def scene_margin(scenario: Scenario) -> float:
-    """Room (m) around everything that moved, for the circles around robots."""
+    """Margin (m) around all paths, for the circles around robots."""
     return max(float(scenario.capture_distance), float(scenario.collision_distance)) + _ROOM
 
 
 def scene_extent(trajectory: Trajectory, near: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x and y (m) of anything that moved, and of the target; of pursuers only where they
-    are within `near` (m) of the evader."""
+    """Least and largest x and y (m) of all paths and of the target; of pursuers only where they are within
+    `near` (m) of the evader."""
     worlds = trajectory.worlds
     evader, pursuers = np.asarray(worlds.evader), np.asarray(worlds.pursuers)[..., :2]
     close = np.linalg.norm(pursuers - evader[:, None], axis=-1) <= near
@@ -184,15 +183,15 @@ def scene_limits(
     period: int | None = None,
     near: float = np.inf,
 ) -> Limits:
-    """Lowest and highest x and y (m) of a scene with all that `draw_scene` puts into it: paths, circles,
-    and the level sets at control period `period` (the tightest if not given), none cut. Pursuers count
-    only where they are within `near` (m) of the evader.
+    """Least and largest x and y (m) of everything that `draw_scene` draws: paths, circles, and level sets at
+    control period `period` (default: see `tightest_period`). Pursuers count only where they are within `near`
+    (m) of the evader.
     """
     low, high = scene_extent(trajectory, near)
     margin = scene_margin(scenario)
     world = world_at(trajectory, tightest_period(trajectory) if period is None else period)
     poses = np.asarray(world.pursuers)
-    # The sets of one that has just gone out of reach may still be in the picture.
+    # The sets of a pursuer that has just gone out of reach may still be in the picture.
     poses = poses[np.linalg.norm(poses[:, :2] - np.asarray(world.evader), axis=-1) <= 2.0 * near]
     outlines = LevelOutlines(scenario, pursuit=shield in PURSUIT_SHIELDS)
     level = outlines.at(poses, np.asarray(world.obstacles)[:, :2], max(LEVELS))
@@ -204,7 +203,7 @@ def scene_limits(
 
 
 def common_limits(limits: Iterable[Limits]) -> Limits:
-    """The smallest limits that hold all of these."""
+    """The smallest limits that contain all of these."""
     lows, highs = zip(*limits, strict=True)
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
@@ -219,8 +218,8 @@ def draw_scene(
     period: int | None = None,
     limits: Limits | None = None,
 ) -> None:
-    """Everything that moved, with time marks and a mark where it ended; capture and level sets at control
-    period `period`."""
+    """Draw all paths, with time marks and a mark at the end; capture and level sets at control period
+    `period`."""
     period = tightest_period(trajectory) if period is None else period
     world = world_at(trajectory, period)
     if limits is None:
@@ -251,7 +250,7 @@ def draw_scene(
 
 
 def _end_look(outcome: str) -> dict[str, Any]:
-    """How the end of the evader's path is marked."""
+    """The look of the mark at the end of the evader's path."""
     if outcome in ("captured", "collided"):
         look = style.mark(style.OUTCOME_COLOURS[outcome], 9)
         return look | {"marker": style.OUTCOME_MARKERS[outcome]}
@@ -260,7 +259,7 @@ def _end_look(outcome: str) -> dict[str, Any]:
 
 
 def scene_legend(axes: Axes, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
-    """The key of these scenes, in axes of its own, where it cannot cover anything."""
+    """The legend of these scenes, in separate axes."""
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=style.EVADER, marker="o", markersize=4, label="evader"),
         Line2D([], [], color=style.PURSUER, marker=">", markersize=4, label="pursuer"),
@@ -335,7 +334,7 @@ def draw_barriers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> Non
 
 
 def draw_corrections(axes: Axes, scenario: Scenario, trajectory: Trajectory, norm: Normalize) -> None:
-    """How far the shield changed the velocity over time, in the colours of the path."""
+    """The size of the correction over time, in the colours of the path."""
     times, correction = _times(scenario, trajectory), np.asarray(trajectory.intervention)
     style.light_grid(axes, "y")
     _shade_infeasible(axes, scenario, trajectory)
@@ -377,12 +376,12 @@ ANSWERS = {
 
 
 def _draw_answers(axes: Axes, scenario: Scenario, trajectory: Trajectory) -> None:
-    """The status of every control period as a strip, with a key of those that occur and how often."""
+    """The status of every control period as a strip, with a legend of those that occur and their shares."""
     status, handles = np.asarray(trajectory.status), []
     for value, (colour, words) in ANSWERS.items():
         share = float(np.mean(status == value)) if len(status) else 0.0
         if share:
-            # A bar per stretch, not per period: thousands of hairlines would not print.
+            # One bar per stretch instead of thousands of hairlines.
             axes.broken_barh(_stretches(scenario, status == value), (0.0, 1.0), facecolor=colour, linewidth=0)
             handles.append(Patch(facecolor=colour, label=f"{words}, {100 * share:.1f} %"))
     axes.set_ylim(0.0, 1.0)

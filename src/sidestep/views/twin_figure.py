@@ -1,4 +1,4 @@
-"""The figure that sets an episode on robots beside the same scene in the plain simulation."""
+"""The figure that compares an episode on a plant with the same scene in the simulation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def twin_figure(
     twin_words: str = "physics twin",
     near: float = np.inf,
 ) -> tuple[Path, Path]:
-    """Both paths at one scale, and below them the least distance to a pursuer and to an obstacle over time.
+    """Both scenes at one scale, and the least distances to a pursuer and to an obstacle over time.
 
     A pursuer that is farther than `near` (m) from the evader may be out of the picture.
 
@@ -73,7 +73,7 @@ def twin_figure(
             style.light_grid(axes, "y")
         pursuers.sharex(obstacles)
         pursuers.tick_params(axis="x", labelbottom=False)
-        # Beside the title, where no curve runs.
+        # Beside the title, where no curve is.
         pursuers.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2)
         obstacles.set_xlabel("time, s")
         obstacles.set_xlim(0.0, period * max(simulation.length, twin.length))
@@ -86,7 +86,7 @@ def twin_figure(
 
 
 def _scale(axes: Axes, least: float, name: str, trajectories: Iterable[Trajectory]) -> None:
-    """A logarithmic axis that holds both curves whole, with the contact distance at its foot."""
+    """A logarithmic axis for both curves, with the contact distance at the bottom."""
     found = np.concatenate([_distances(trajectory, name) for trajectory in trajectories])
     found = found[np.isfinite(found) & (found > 0.0)]
     low, high = float(np.min(found, initial=least)), float(np.max(found, initial=3.0 * least))
@@ -102,7 +102,7 @@ def _scale(axes: Axes, least: float, name: str, trajectories: Iterable[Trajector
 
 
 def _distances(trajectory: Trajectory, group: str) -> Float[np.ndarray, "t"]:
-    """Least distance (m) from the evader to any of a group at the beginning of every period."""
+    """The evader's least distance (m) to a robot of a group at the beginning of every period."""
     robots = np.asarray(getattr(trajectory.worlds, group))[..., :2]
     apart = np.linalg.norm(robots - np.asarray(trajectory.worlds.evader)[:, None], axis=-1)
     return np.min(apart, axis=1, initial=np.inf)

@@ -1,4 +1,4 @@
-"""How do pictures become a video file: .mp4, .gif or .webp, whole or not at all?"""
+"""Write pictures as a video file (.mp4, .gif or .webp), whole or not at all."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
 SUFFIXES = (".mp4", ".gif", ".webp")
 HOLD = Bound(least=0.0, most=1e6, unit="s")
 _H264 = {"crf": "21", "preset": "veryfast", "tune": "animation"}
-"""Quality 21: 18 is hardly to be told from the original, 28 looks worn. Slower presets gain nothing here."""
+"""Quality 21: 18 is visually lossless, 28 has visible artefacts. Slower presets do not help."""
 _COLOURS = 127
-"""Of the 128 entries of a palette, the last one stands for what has not changed."""
+"""The last of the palette's 128 entries, which means an unchanged pixel."""
 _EXACT = 32
-"""How many colours get an entry because they are frequent."""
+"""Number of palette entries for the most frequent colours."""
 
 
 class VideoError(ValueError):
-    """A video that cannot be written as asked; the message says what to change or to install."""
+    """A video that cannot be written; the message says what to change or install."""
 
 
 def check_video(path: str | Path, *, overwrite: bool = True) -> Path:
-    """The path, if a video can be written there: asked before any work is done.
+    """Returns the path if a video can be written there; for a check before any work is done.
 
-    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a place that cannot
-    be written to, for a file that exists unless `overwrite`, and when the package that writes it is not
-    installed.
+    **Raises** `VideoError` for another suffix than .mp4, .gif and .webp, for a folder or a path that cannot
+    be written, for an existing file unless `overwrite`, and when the required package is not installed.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -79,18 +78,18 @@ def write_video_file(
     hold: float = 0.0,
     samples: Pictures | None = None,
 ) -> Path:
-    """Write pictures as a video; the suffix of `path` says which. Folders on the way to it are made.
+    """Write pictures as a video in the format of the suffix of `path`. Missing folders are created.
 
-    MP4 is H.264 with 4:2:0 colours and its index in front, which browsers and players play at once. GIF and
-    WebP have one palette for all pictures, without dithering, and repeat for ever; what is drawn stays as
-    sharp as it was, photographs would not.
+    MP4 is H.264 with 4:2:0 colours and its index in front, as browsers and players need. GIF and WebP have
+    one palette for all pictures, without dithering, and repeat forever; this keeps drawings sharp, but not
+    photographs.
 
-    **Arguments:** `pictures` in RGB, one after the other: an MP4 of any length needs the memory of one, GIF
-    and WebP that of a byte per pixel and picture; `rate` pictures per second; `hold` how long (s) the last
-    one stays; `samples` pictures to choose the palette from (the first one if not given).
+    **Arguments:** `pictures` in RGB, an iterable; MP4 needs the memory of one picture, GIF and WebP one byte
+    per pixel and picture; `rate` pictures per second; `hold` time (s) for which the last one stays; `samples`
+    pictures from which to choose the palette (default: the first one).
 
-    **Raises** as `check_video`, and `VideoError` for an odd size of an MP4 or no picture at all. Whatever
-    happens, no part of a file is left.
+    **Raises** as `check_video`, and `VideoError` for an odd size of an MP4 or no picture at all. After an
+    error no partial file is left.
     """
     path = check_video(path)
     taken("rate", rate, Bound(least=1, whole=True), VideoError)
@@ -114,7 +113,7 @@ def _write_mp4(path: Path, pictures: Pictures, size: tuple[int, ...], rate: int,
     height, width = size
     if height % 2 or width % 2:
         raise VideoError(f"{width} x {height} pixels: an MP4 needs even numbers")
-    # Players take large pictures for BT.709 and small ones for something else unless told.
+    # Without a declared colour space, players assume BT.709 for large pictures and another for small ones.
     space = av.video.reformatter.Colorspace.ITU709
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=Fraction(rate), options=_H264)
@@ -138,7 +137,7 @@ def _as_frame(av: Any, picture: Any, space: Any) -> Any:
 def _write_gif(path: Path, pictures: Pictures, palette: _Palette, rate: int, hold: float) -> None:
     durations = _Durations(rate, hold, unit=10)
     shown = _indexed(pictures, palette, durations)
-    # Pillow would leave a file open that it opened itself, when it is interrupted.
+    # When interrupted, Pillow would leave open a file that it opened itself.
     with open(path, "wb") as file:
         next(shown).save(
             file, format="GIF", save_all=True, append_images=shown, duration=durations, loop=0, optimize=True,
@@ -150,7 +149,7 @@ def _write_webp(path: Path, pictures: Pictures, palette: _Palette, rate: int, ho
     durations = _Durations(rate, hold, unit=1)
     shown = _indexed(pictures, palette, durations)
     with open(path, "wb") as file:
-        # Without key frames, which nobody needs in what is played from the beginning.
+        # No key frames, because it is played from the beginning.
         next(shown).save(
             file, format="WEBP", save_all=True, append_images=shown, duration=durations, loop=0,
             lossless=True, quality=60, method=2, kmin=0, kmax=0,
@@ -158,20 +157,20 @@ def _write_webp(path: Path, pictures: Pictures, palette: _Palette, rate: int, ho
 
 
 class _Durations(list[int]):
-    """How long (ms) each picture is shown, in whole units of the format: rounded without drifting."""
+    """Duration (ms) of each picture in whole units of the format, rounded without drift."""
 
     def __init__(self, rate: int, hold: float, unit: int):
         super().__init__()
         self._length, self._hold, self._unit = 1000.0 / rate / unit, 1000.0 * hold / unit, unit
 
     def next(self, last: bool) -> None:
-        """One more picture; the last one stays for the hold, too."""
+        """Add a picture; the last one includes the hold."""
         begin, end = len(self) * self._length, (len(self) + 1) * self._length
         self.append(self._unit * (round(end + (self._hold if last else 0.0)) - round(begin)))
 
 
 def _indexed(pictures: Pictures, palette: _Palette, durations: _Durations) -> Iterator[Any]:
-    """The pictures with palette, each after its duration has been noted."""
+    """The pictures with the palette; adds each one's duration first."""
     stream = iter(pictures)
     now = next(stream, None)
     while now is not None:
@@ -183,11 +182,11 @@ def _indexed(pictures: Pictures, palette: _Palette, durations: _Durations) -> It
 
 @final
 class _Palette:
-    """127 colours for pictures like the samples, and one more that no picture gets.
+    """127 colours for pictures like the samples, and one for unchanged pixels.
 
-    The most frequent colours, which are those of areas, exactly; of the others, some from wherever there
-    are any, however rare, since a target is small. Pillow's own assignment would turn white into nearly
-    white; this one takes the nearest colour, and remembers it.
+    It contains the most frequent colours, which are those of areas, exactly, and a selection of all others,
+    because small objects such as the target have rare colours. Each pixel gets the nearest colour, which is
+    cached; Pillow's assignment turns white into nearly white.
     """
 
     def __init__(self, samples: Pictures):
@@ -208,14 +207,14 @@ class _Palette:
         self._nearest = np.full(1 << 24, _COLOURS, np.uint8)
 
     def image(self, picture: UInt8[np.ndarray, "height width 3"]) -> Any:
-        """The picture as one of Pillow's, with this palette."""
+        """The picture as a Pillow image with this palette."""
         packed = _packed(picture)
         index = self._nearest[packed]
         new = np.unique(packed[index == _COLOURS])
         if len(new):
             palette = self.colours[:_COLOURS].astype(np.float32)
             colours = _unpacked(new).astype(np.float32)
-            # |a - b|^2 without the part that is the same for all b.
+            # |a - b|^2 without the term that is equal for all b.
             apart = np.sum(palette**2, axis=-1) - 2.0 * colours @ palette.T
             self._nearest[new] = np.argmin(apart, axis=-1)
             index = self._nearest[packed]

@@ -1,6 +1,6 @@
-"""The live page: a person drives the pursuer and tries to catch the shielded robot.
+"""The live page: a visitor drives the pursuer and tries to capture the shielded robot.
 
-Needs the extra `[play]`; nothing of it is imported before `serve` or `make_app` is called.
+Needs the extra `[play]`, which is imported only by `serve` and `make_app`.
 """
 
 from sidestep.views.play.limits import Limits

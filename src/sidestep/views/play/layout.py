@@ -1,4 +1,4 @@
-"""Many named arrays as one vector, and back."""
+"""Pack many named arrays into one vector."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 
 @final
 class Layout:
-    """Where each of several named arrays lies in one vector.
+    """The positions of several named arrays in one vector.
 
-    Handing one array to a compiled program, and taking one back, costs a fraction of what many small ones do.
+    Passing one array to a compiled program, and getting one back, is much faster than many small ones.
 
     **Arguments:** `shapes` by name, in order.
     """
@@ -29,7 +29,7 @@ class Layout:
         self.size = end
 
     def split(self, vector: Any) -> dict[str, Any]:
-        """The arrays of a vector `(size,)`; of many at once, `(..., size)`, each with their axes in front."""
+        """The arrays of a vector `(size,)`, or of many vectors `(..., size)`, with their axes first."""
         return {
             name: vector[..., place].reshape((*vector.shape[:-1], *self.shapes[name]))
             for name, place in self._places.items()
@@ -41,7 +41,7 @@ class Layout:
         return jnp.concatenate([jnp.ravel(jnp.asarray(parts[name])).astype(dtype) for name in self.shapes])
 
     def filled(self, parts: Mapping[str, Any], dtype: Any) -> np.ndarray:
-        """The vector of concrete numbers; what is not given is 0."""
+        """The vector of concrete numbers; missing arrays are 0."""
         vector = np.zeros(self.size, dtype)
         for name, values in parts.items():
             vector[self._places[name]] = np.ravel(np.asarray(values))

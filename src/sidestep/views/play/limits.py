@@ -1,4 +1,4 @@
-"""How much may one visitor, and all of them together, ask of the server?"""
+"""Limits of the server's load by visitors."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ from sidestep._bounds import VISITORS, bounded
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds that keep a server alive whatever arrives.
+    """Limits that protect the server from overload.
 
-    - `visitors` at once; one more is told that there is no room
-    - `message_bytes` of one message; a longer one ends that visitor's connection
-    - `message_rate` (1/s) on average and `message_burst` at once; what comes beyond is dropped unread
+    - `visitors` at once; a further one is refused
+    - `message_bytes` of one message; a longer one ends the visitor's connection
+    - `message_rate` (1/s) on average and `message_burst` at once; further messages are dropped unread
     - `pending` edits that wait for the next period; further ones are refused
-    - `frames_ahead`: frames sent but not yet acknowledged, beyond which newer ones replace each other here
-    - `recorded_periods` of one episode; it is played on, but recorded no further
-    - `silence` (s) without any message after which a visitor that has acknowledged frames before is taken to
-      have gone
+    - `frames_ahead`: number of unacknowledged frames from which on a new frame replaces the waiting one
+    - `recorded_periods` of one episode; later periods are not recorded
+    - `silence` (s) without a message after which the connection is closed, if the visitor has acknowledged
+      frames before
     """
 
     visitors: int = bounded(8, VISITORS)

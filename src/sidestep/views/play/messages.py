@@ -1,4 +1,4 @@
-"""What may a visitor say? Every message is read here, and nothing unread goes any further."""
+"""The messages of a visitor, with their validation."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from msgspec import Meta
 
 from sidestep._bounds import one_of, taken
 from sidestep.safety.shields.catalogue import SHIELDS
-from sidestep.views.play.helm import STRATEGIES
+from sidestep.views.play.control import STRATEGIES
 from sidestep.views.play.sliders import PACES, YOU, Slider
 
 FARTHEST = 50.0
-"""m; no place farther from the origin is taken."""
+"""Largest distance (m) of a position from the origin."""
 Share = Annotated[float, Meta(ge=-1.0, le=1.0)]
 Metres = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
 Place = tuple[Metres, Metres]
@@ -25,64 +25,64 @@ Drifting = tuple[Metres, Metres, Metres, Metres]
 
 
 class MessageError(ValueError):
-    """A message that is not understood; the text says why."""
+    """An invalid message; the text says why."""
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True, tag=str.lower):
-    """A JSON object with these entries, and the name of the class in small letters as its `type`."""
+    """A JSON object with these entries, and the lower-case name of the class as its `type`."""
 
 
 class Drive(_Message):
-    """Towards a place (m), or with shares in [-1, 1] of the left and right wheel speed, or not at all."""
+    """Drive to a point (m), or with shares in [-1, 1] of the left and right wheel speed, or stop."""
 
     wheels: tuple[Share, Share] | None = None
     toward: Place | None = None
 
 
 class Seen(_Message):
-    """The last frame that has been drawn."""
+    """Acknowledges the last frame that has been drawn."""
 
     frame: Annotated[int, Meta(ge=0, le=2**53)]
 
 
 class Pause(_Message):
-    """Stop or go on."""
+    """Pause or continue."""
 
     paused: bool
 
 
 class Step(_Message):
-    """One control period while paused."""
+    """Advance by one control period while paused."""
 
 
 class Pace(_Message):
-    """Seconds of the world in one second of the visitor's."""
+    """Set the simulated seconds per second."""
 
     pace: Annotated[float, Meta(ge=PACES[0], le=PACES[1])]
 
 
 class Reset(_Message):
-    """A new start; `again`: the last one once more."""
+    """Begin a new episode; `again`: with the same start."""
 
     again: bool = False
 
 
 class Pick(_Message):
-    """Another shield or another pursuer."""
+    """Choose another shield or pursuer."""
 
     shield: str | None = None
     pursuer: str | None = None
 
 
 class Numbers(_Message, tag="set"):
-    """Sliders that were moved, by name; `defaults`: all others back to where they were."""
+    """Values of moved sliders, by name; `defaults`: all others are reset."""
 
     values: dict[str, float] = msgspec.field(default_factory=dict)
     defaults: bool = False
 
 
 class Move(_Message):
-    """Something was dragged to a place (m), or turned (rad)."""
+    """Move a robot to a position (m), or rotate it (rad)."""
 
     what: Literal["evader", "target", "pursuer", "obstacle"]
     to: Place
@@ -91,14 +91,14 @@ class Move(_Message):
 
 
 class Show(_Message):
-    """Which parts of a frame that cost something are wanted."""
+    """Choose the expensive parts of frames."""
 
     rows: bool
     plan: bool
 
 
 class Scene(msgspec.Struct, forbid_unknown_fields=True):
-    """Where everything is: m, rad, m/s."""
+    """The positions of all robots: m, rad, m/s."""
 
     evader: tuple[Place]
     target: tuple[Place]
@@ -107,7 +107,7 @@ class Scene(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Restore(_Message):
-    """The state of a link: picks, all numbers that differ, and the scene if there is one."""
+    """Restore the state of a link: shield and pursuer, all changed numbers, and optionally the scene."""
 
     shield: str | None = None
     pursuer: str | None = None
@@ -122,7 +122,7 @@ _SHIELD, _PURSUER = one_of(*SHIELDS), one_of(YOU, *STRATEGIES)
 
 @dataclass(frozen=True)
 class Reader:
-    """Reads the messages of visitors to a scenario with these sliders and so many robots."""
+    """Reads messages for a scenario with these sliders and numbers of robots."""
 
     sliders: Mapping[str, Slider]
     pursuers: int
@@ -132,11 +132,11 @@ class Reader:
     def read(self, text: str | bytes | None) -> Message:
         """The message of one text frame.
 
-        **Raises** `MessageError` for whatever is not exactly a message of the protocol.
+        **Raises** `MessageError` for anything else than a message of the protocol.
         """
         if not isinstance(text, str):
             raise MessageError("messages are text")
-        # Characters may take several bytes; the cheap test comes first.
+        # A character may have several bytes; the cheap test comes first.
         if len(text) > self.longest or len(text.encode("utf-8", "replace")) > self.longest:
             raise MessageError(f"a message has at most {self.longest} bytes")
         try:

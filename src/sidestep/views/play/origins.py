@@ -1,4 +1,4 @@
-"""Which requests come from our own page, and not from someone else's?"""
+"""Check that requests come from this server's page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 
 def host_name(host: str | None) -> str | None:
-    """The name or address in a `Host` header, without the port, in lower case; None if it is none."""
+    """The name or address in a `Host` header, without the port, in lower case; None if invalid."""
     if not host or any(character in host for character in "/@?#\\ "):
         return None
     try:
@@ -19,11 +19,9 @@ def host_name(host: str | None) -> str | None:
 
 
 def is_known_host(host: str | None, allowed: Iterable[str]) -> bool:
-    """Whether a request was addressed to this machine under a name that can only mean it.
-
-    An address, `localhost`, this machine's own name, or one that was `allowed`. A page of someone else who
-    makes a name of theirs point here (DNS rebinding) would come with that name.
-    """
+    """Whether a request was addressed to this machine by a trusted name: an address, `localhost`, this
+    machine's name, or one of `allowed`. This protects against DNS rebinding, in which another site's name
+    points to this machine."""
     name = host_name(host)
     if name is None:
         return False
@@ -37,7 +35,7 @@ def is_known_host(host: str | None, allowed: Iterable[str]) -> bool:
 
 
 def is_own_origin(headers: Mapping[str, str]) -> bool:
-    """Whether a socket is opened by our own page, or by a program that is no browser and says no origin."""
+    """Whether a socket is opened by this server's page, or by a program that sends no origin."""
     origin = headers.get("origin")
     if origin is None:
         return True

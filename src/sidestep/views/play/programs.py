@@ -1,4 +1,4 @@
-"""Compiled control steps, shared by all visitors and compiled out of their way."""
+"""Compiled control steps, shared by all visitors and compiled in the background."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from sidestep.views.play.program import Program, Starts, traced
 from sidestep.world import Scenario
 
 COLD, WARMING, READY, FAILED = "cold", "warming", "ready", "failed"
-"""How far the program of a shield is."""
+"""The states of a shield's program."""
 
 _log = logging.getLogger(__name__)
 
 
 @final
 class Programs:
-    """The program of every shield for one scenario, each compiled when it is first wanted.
+    """The programs of all shields for one scenario, each compiled when it is first needed.
 
-    `warm` returns at once; a thread of its own does the work, one shield after the other.
+    `warm` returns at once; a separate thread compiles one shield after the other.
 
-    **Raises** `ValueError` for robots of one's own, of which the page can draw and step nothing.
+    **Raises** `ValueError` for custom robots, which the page does not support.
     """
 
     def __init__(self, scenario: Scenario, policy: Callable[..., Any]):
-        scenario.check_built_in("the page", "watch an episode of theirs instead, sidestep evaluate --video")
+        scenario.check_built_in("the page", "make a video instead, sidestep evaluate --video")
         self.scenario, self.policy = scenario, policy
         self._programs = {name: Program(scenario, name, policy) for name in SHIELDS}
         self.layout = next(iter(self._programs.values()))
@@ -40,7 +40,7 @@ class Programs:
 
     @property
     def states(self) -> dict[str, str]:
-        """How far each shield is."""
+        """The state of each shield's program."""
         return dict(self._states)
 
     def ready(self, shield: str) -> bool:
@@ -48,14 +48,14 @@ class Programs:
         return self._states[shield] == READY
 
     def warm(self, *shields: str) -> None:
-        """Have these compiled, in this order, those that are not yet."""
+        """Compile those of these that are not compiled yet, in this order."""
         for shield in shields:
             if self._states[shield] == COLD:
                 self._states[shield] = WARMING
                 self._worker.submit(self._compile, shield)
 
     def close(self) -> None:
-        """Compile nothing more."""
+        """Stop compiling."""
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def _compile(self, shield: str) -> None:
@@ -65,6 +65,6 @@ class Programs:
             program.compile(traced(self.scenario, self.policy), vector)
             self._states[shield] = READY
         except Exception:
-            # Nobody waits for this thread: what went wrong is said in the log and on the page.
+            # The error of this thread is shown in the log and on the page.
             _log.exception("the shield %s could not be compiled", shield)
             self._states[shield] = FAILED

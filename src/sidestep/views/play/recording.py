@@ -1,4 +1,4 @@
-"""One episode kept period by period, in bounded memory."""
+"""Record one episode period by period, in bounded memory."""
 
 from __future__ import annotations
 
@@ -19,53 +19,53 @@ _TAKEN = ("nominal", "action", "barriers", "slack", "intervention")
 
 @final
 class Recording:
-    """The periods since `restart`, at most `most` of them: later ones are left out.
+    """The first `most` periods since `restart`.
 
-    **Arguments:** `place` of the world at the beginning of a period, `told` of what a `Program` said of it.
+    **Arguments:** layouts of `place`, the world at the beginning of a period, and of a `Program`'s `outputs`.
     """
 
-    def __init__(self, place: Layout, told: Layout, most: int):
-        self._place, self._told = place, told
-        # Pages that are never written take no memory.
+    def __init__(self, place: Layout, outputs: Layout, most: int):
+        self._place, self._layout = place, outputs
+        # Memory pages that are never written take no memory.
         self._begun = np.empty((most, place.size), np.float32)
-        self._said = np.empty((most, told.size), np.float32)
+        self._outputs = np.empty((most, outputs.size), np.float32)
         self.length = 0
 
     @property
     def full(self) -> bool:
-        """Whether nothing more is taken."""
-        return self.length == len(self._said)
+        """Whether further periods are ignored."""
+        return self.length == len(self._outputs)
 
     def restart(self) -> None:
-        """Forget everything: what comes next does not follow from what was."""
+        """Discard all periods."""
         self.length = 0
 
-    def add(self, begun: Any, said: Any) -> None:
-        """One period: the world at its beginning, and what was told of it, as vectors."""
+    def add(self, begun: Any, output: Any) -> None:
+        """Add a period: the vectors of the world at its beginning and of the program's output."""
         if not self.full:
             self._begun[self.length] = begun
-            self._said[self.length] = said
+            self._outputs[self.length] = output
             self.length += 1
 
     def copy(self) -> tuple[np.ndarray, np.ndarray]:
-        """What has been recorded, to make a trajectory of while the game goes on."""
-        return self._begun[: self.length].copy(), self._said[: self.length].copy()
+        """A copy of the vectors, for `trajectory` while the episode continues."""
+        return self._begun[: self.length].copy(), self._outputs[: self.length].copy()
 
-    def trajectory(self, begun: np.ndarray, said: np.ndarray) -> Trajectory:
-        """What `copy` returned, as all else in the package knows an episode.
+    def trajectory(self, begun: np.ndarray, outputs: np.ndarray) -> Trajectory:
+        """The vectors of `copy` as a `Trajectory`.
 
         **Raises** `ValueError` when nothing has been recorded.
         """
-        if not len(said):
+        if not len(outputs):
             raise ValueError("nothing has been recorded yet")
-        first, told = self._place.split(begun), self._told.split(said)
-        parts = {name: np.concatenate([first[name], told[name][-1:]]) for name in self._place.shapes}
-        flags = {name: jnp.asarray(told[name] > 0.5) for name in _FLAGS}
-        rest = {name: jnp.asarray(told[name]) for name in EVENTS if name not in _FLAGS}
+        first, output = self._place.split(begun), self._layout.split(outputs)
+        parts = {name: np.concatenate([first[name], output[name][-1:]]) for name in self._place.shapes}
+        flags = {name: jnp.asarray(output[name] > 0.5) for name in _FLAGS}
+        rest = {name: jnp.asarray(output[name]) for name in EVENTS if name not in _FLAGS}
         return Trajectory(
             worlds=worlds_of(parts),
-            wheel_speeds=jnp.asarray(told["wheels"]),
-            status=jnp.asarray(told["status"].astype(np.int32)),
+            wheel_speeds=jnp.asarray(output["wheels"]),
+            status=jnp.asarray(output["status"].astype(np.int32)),
             events=Events(**flags, **rest),
-            **{name: jnp.asarray(told[name]) for name in _TAKEN},
+            **{name: jnp.asarray(output[name]) for name in _TAKEN},
         )

@@ -1,4 +1,4 @@
-"""What has the visitor achieved against each shield?"""
+"""The visitor's score against each shield."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Score:
         return self.tallies.setdefault(shield, Tally())
 
     def lasted(self, shield: str, period: float) -> None:
-        """One more period was survived."""
+        """Add one survived period."""
         self.survived += period
         tally = self.of(shield)
         tally.longest = max(tally.longest, self.survived)
 
     def restart(self) -> None:
-        """Survival is counted from now."""
+        """Restart the survival time."""
         self.survived = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """JSON values."""
         tallies = {name: asdict(tally) for name, tally in self.tallies.items()}
         for tally in tallies.values():
             tally["longest"] = round(tally["longest"], 2)

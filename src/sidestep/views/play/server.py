@@ -20,7 +20,7 @@ from sidestep._packages import needed
 from sidestep.loop import Trajectory, save_trajectory
 from sidestep.loop.policies import as_policy
 from sidestep.safety.shields.catalogue import SHIELDS
-from sidestep.views.play.helm import STRATEGIES
+from sidestep.views.play.control import STRATEGIES
 from sidestep.views.play.limits import Limits
 from sidestep.views.play.origins import is_known_host, is_own_origin
 from sidestep.views.play.programs import Programs
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 STATIC = Path(__file__).with_name("static")
 _ENDLESS = 2**30
-"""Control periods; the page's episodes end by capture or collision only."""
+"""Time limit in control periods; the page's episodes end by capture or collision only."""
 _FULL = 4013
-"""Code of a connection closed because there is no room."""
+"""Close code of a connection refused because of too many visitors."""
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -48,7 +48,7 @@ _HEADERS = {
 }
 
 Saver = Callable[[Path, Trajectory, Scenario, Mapping[str, Any]], None]
-"""Writes an episode to a file: path, trajectory, scenario, what else is known of it."""
+"""Writes an episode to a file: path, trajectory, scenario, metadata."""
 
 
 def _save_npz(path: Path, trajectory: Trajectory, scenario: Scenario, about: Mapping[str, Any]) -> None:
@@ -57,10 +57,10 @@ def _save_npz(path: Path, trajectory: Trajectory, scenario: Scenario, about: Map
 
 @dataclass(frozen=True)
 class Hosting:
-    """What is played, and for whom.
+    """The settings of the page.
 
-    `shield` and `pursuer` (a strategy, or `you`) at first; `allowed_hosts` names beside addresses and
-    `localhost` under which the page may be asked for; `savers` of episodes by file suffix.
+    `shield` and `pursuer` (a strategy, or `you`) initially; `allowed_hosts`, further host names besides
+    addresses and `localhost` under which the page is served; `savers` of episodes by file suffix.
     """
 
     scenario: Scenario
@@ -74,7 +74,7 @@ class Hosting:
 
 
 class PlayError(ValueError):
-    """The page cannot be served as asked; the message says what to install or to change."""
+    """The page cannot be served; the message says what to install or change."""
 
 
 def make_app(hosting: Hosting) -> Any:
@@ -127,7 +127,7 @@ def make_app(hosting: Hosting) -> Any:
             await websocket.close(1008)
             return
         if len(visitors) >= limits.visitors:
-            # Accepted first, or else the page could not tell this from a server that is not there.
+            # Accepted first, so that the page can distinguish this from a missing server.
             await websocket.accept()
             await websocket.close(_FULL, "no room for another visitor")
             return
@@ -164,14 +164,14 @@ def make_app(hosting: Hosting) -> Any:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Any) -> AsyncIterator[None]:
-        # Without a shield everything is there in a moment; the others take longer to compile.
+        # The program without a shield compiles fast; the others take longer.
         programs.warm("none", hosting.shield)
         yield
         programs.close()
         workers.shutdown(wait=False, cancel_futures=True)
 
     class Static(StaticFiles):
-        """Static files with our headers."""
+        """Static files with the security headers."""
 
         async def get_response(self, path: str, scope: Any) -> Any:
             response = await super().get_response(path, scope)
@@ -193,7 +193,7 @@ def make_app(hosting: Hosting) -> Any:
 
 
 class _KnownHosts:
-    """Refuses requests that were addressed to a name that is not ours."""
+    """Refuses requests addressed to an unknown host name."""
 
     def __init__(self, app: Any, allowed: tuple[str, ...]):
         self.app, self.state = app, app.state
@@ -229,7 +229,7 @@ def _check(hosting: Hosting) -> None:
 
 
 def _greeting(hosting: Hosting, session: Session, token: str, formats: list[str]) -> dict[str, Any]:
-    """Everything that the page must know and that never changes."""
+    """The page's constant data."""
     scenario = session.base
     return {
         "type": "hello",
@@ -258,9 +258,9 @@ def _written(session: Session, saver: Saver, suffix: str) -> bytes:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens there; port 0 takes a free one.
+    """A listening socket; port 0 selects a free one.
 
-    **Raises** `PlayError` when it cannot be had.
+    **Raises** `PlayError` when the address or port is not available.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
@@ -271,7 +271,7 @@ def listen(host: str, port: int) -> socket.socket:
         raise PlayError(f"no such address: {host}, port {port} ({error})") from None
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # So that little waits in the system for a visitor who does not read; connections inherit it.
+        # A small buffer, so that little data waits for a slow visitor; connections inherit it.
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16384)
         listener.bind(address)
         listener.listen(64)
@@ -291,7 +291,7 @@ def make_server(app: Any, limits: Limits) -> Any:
     from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
     class Protocol(WebSocketsSansIOProtocol):
-        """Waits for the visitor once a few frames have not gone out."""
+        """Pauses sending when a few frames wait in the buffer."""
 
         def connection_made(self, transport: Any) -> None:
             transport.set_write_buffer_limits(high=8192)
@@ -307,7 +307,7 @@ def make_server(app: Any, limits: Limits) -> Any:
         ws_ping_interval=10.0,
         ws_ping_timeout=15.0,
         ws_per_message_deflate=False,
-        # Page, files and socket of every visitor at once, and as many again who are turned away.
+        # Page, files and socket of every visitor at once, and as many again that are refused.
         limit_concurrency=32 * (limits.visitors + 1),
         h11_max_incomplete_event_size=16384,
         timeout_graceful_shutdown=2,
@@ -322,7 +322,7 @@ def serve(
     *,
     announce: Callable[[str], None] | None = None,
 ) -> None:
-    """Serve the page until interrupted; `announce` is told its address once it answers.
+    """Serve the page until interrupted; `announce(address)` is called once it is available.
 
     **Raises** as `make_app` and `listen`.
     """

@@ -1,4 +1,4 @@
-"""One visitor's world: what happens in it, and what the visitor is told of it."""
+"""One visitor's world: its simulation, and the frames sent to the visitor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sidestep.safety.certificate.situation import plain
 from sidestep.safety.filter.status import Status
-from sidestep.views.play import helm
+from sidestep.views.play import control
 from sidestep.views.play.limits import Limits
 from sidestep.views.play.messages import (
     Drive,
@@ -35,22 +35,21 @@ from sidestep.views.play.verdict import quick_verdict, verdict
 from sidestep.world import Scenario
 
 _EDGE = 0.4
-"""m beyond the square of the starts, where an obstacle turns back."""
+"""Distance (m) beyond the square of the starts at which an obstacle reverses."""
 _CLEAR = 1.0
-"""m; no obstacle turns back nearer than this to the robot."""
+"""Obstacles do not reverse within this distance (m) of the robot."""
 _PLAN_EVERY = 5
 _PATIENCE = 30.0
-"""s after which a target that is not reached gives way to another: a pursuer may stand guard over one."""
+"""Time (s) after which an unreached target is replaced, because a pursuer may block it."""
 
 
 @final
 class Session:
-    """A world that goes on period by period, for one visitor; not for several threads at once.
+    """A world simulated period by period, for one visitor. Not thread-safe.
 
-    The robot drives from target to target: one that is reached, or not in half a minute, is
-    replaced by another. A capture or a
-    collision ends the episode (`outcome`); `restart` begins the next. Nothing else is waited for: with the
-    program of a shield still compiling, `advance` does nothing.
+    The robot drives from target to target: a target that is reached, or not reached within `_PATIENCE`, is
+    replaced. A capture or a collision ends the episode (`outcome`); `restart` begins the next. While the
+    shield's program is being compiled, `advance` does nothing.
     """
 
     def __init__(self, programs: Programs, shield: str, pursuer: str, limits: Limits, seed: int):
@@ -68,19 +67,19 @@ class Session:
         self.outcome: str | None = None
         self.frame_number = 0
         self._random = np.random.default_rng(seed)
-        self._recording = Recording(programs.layout.place, programs.layout.told, limits.recorded_periods)
+        self._recording = Recording(programs.layout.place, programs.layout.outputs, limits.recorded_periods)
         self._drive = Drive()
-        self._told: dict[str, Any] | None = None
+        self._output: dict[str, Any] | None = None
         self._plan: list[list[float]] = []
         self._cut = True
         self._set_numbers(numbers_of(self.base))
         self.restart()
         programs.warm(shield)
 
-    # What the visitor asks for.
+    # The visitor's requests.
 
     def apply(self, message: Message) -> None:
-        """Do what a message says. **Raises** `MessageError` for what cannot be done now."""
+        """Apply a message. **Raises** `MessageError` if that is not possible now."""
         match message:
             case Drive():
                 self._drive = message
@@ -108,7 +107,7 @@ class Session:
                 pass
 
     def restart(self, *, again: bool = False) -> None:
-        """Begin an episode, from a new start or `again` from the last."""
+        """Begin an episode, from a new start or `again` from the last one."""
         if not again:
             seed = int(self._random.integers(2**31))
             self._start = self.programs.starts(self.scenario, seed)
@@ -121,22 +120,22 @@ class Session:
 
     @property
     def moving(self) -> bool:
-        """Whether time goes on."""
+        """Whether the world advances."""
         return self.ready and not self.paused and self.outcome is None
 
     def settle(self) -> None:
-        """Find out what takes some 20 ms to know of new numbers: whether the certificate holds."""
+        """Compute whether the certificate holds for new numbers, which takes about 20 ms."""
         self.verdict = verdict(self.numbers, self.period, self.base.pursuer_count)
 
     @property
     def settled(self) -> bool:
-        """Whether `settle` has nothing to add."""
+        """Whether the result of `settle` is known."""
         return self.verdict.kind != "unsure"
 
-    # What happens.
+    # Simulation.
 
     def advance(self) -> dict[str, Any]:
-        """One control period, if the world moves at all, and the frame that shows it."""
+        """Advance by one control period, if the world moves, and return the frame that shows it."""
         if not self.moving:
             return self.frame()
         begun = {name: np.array(part) for name, part in self._parts.items()}
@@ -145,49 +144,49 @@ class Session:
 
     def _period(self) -> None:
         program = self.programs[self.shield]
-        mode = helm.BY_WHEELS if self._drive.toward is None else helm.BY_POINT
+        mode = control.BY_WHEELS if self._drive.toward is None else control.BY_POINT
         vector = program.vector(
             {
                 **self._parts,
                 "held": self._held,
                 "ask": self._count % self.decision_steps == 0,
-                "strategy": helm.STRATEGIES.index("nash" if self.pursuer == YOU else self.pursuer),
-                "mode": mode if self.pursuer == YOU else helm.BY_STRATEGY,
-                "wanted": self._drive.toward or self._drive.wheels or (0.0, 0.0),
+                "strategy": control.STRATEGIES.index("nash" if self.pursuer == YOU else self.pursuer),
+                "mode": mode if self.pursuer == YOU else control.BY_STRATEGY,
+                "command": self._drive.toward or self._drive.wheels or (0.0, 0.0),
                 "count": self._count % 2**20,
             }
         )
         if self._memory is None:
             self._memory = program.begin(self._arrays, vector)
         if self.show.plan and program.plans and self._count % _PLAN_EVERY == 0:
-            looking = self._told is not None and self._told["looking"] > 0.0
+            looking = self._output is not None and self._output["looking"] > 0.0
             self._plan = _rounded(program.plan(self._arrays, vector, self._memory)) if looking else []
-        said, self._memory = program.step(self._arrays, vector, self._memory)
-        told = self._told = program.told.split(np.asarray(said, np.float64))
-        self._recording.add(vector[: program.place.size], said)
-        self._parts = {name: told[name] for name in program.place.shapes}
-        self._held, self._count = told["nominal"], self._count + 1
+        result, self._memory = program.step(self._arrays, vector, self._memory)
+        output = self._output = program.outputs.split(np.asarray(result, np.float64))
+        self._recording.add(vector[: program.place.size], result)
+        self._parts = {name: output[name] for name in program.place.shapes}
+        self._held, self._count = output["nominal"], self._count + 1
         self.score.lasted(self.shield, self.period)
-        self._judge(told)
+        self._judge(output)
         self._turn_obstacles_back()
 
-    def _judge(self, told: dict[str, Any]) -> None:
+    def _judge(self, output: dict[str, Any]) -> None:
         tally = self.score.of(self.shield)
-        if told["captured"] > 0.0:
+        if output["captured"] > 0.0:
             self.outcome = "captured"
             tally.captured += 1
-        elif told["collided"] > 0.0:
+        elif output["collided"] > 0.0:
             self.outcome = "collided"
             tally.collided += 1
-        elif told["reached"] > 0.0:
+        elif output["reached"] > 0.0:
             tally.reached += 1
         self._waited += self.period
-        if told["reached"] > 0.0 or self._waited > _PATIENCE:
+        if output["reached"] > 0.0 or self._waited > _PATIENCE:
             self._parts["target"] = self._another_target()
             self._waited = 0.0
 
     def _another_target(self) -> np.ndarray:
-        """A place in the square of the starts, clear of everything if one is found in 200 tries."""
+        """A point in the square of the starts, clear of all robots if one is found in 200 tries."""
         half = 0.45 * float(self.base.arena_side)
         clear = self.numbers["collision_distance"] + 0.15
         tip = self.numbers["capture_distance"] + 0.15
@@ -203,7 +202,7 @@ class Session:
         return place
 
     def _turn_obstacles_back(self) -> None:
-        """Obstacles drift straight on for ever; here they come back, so that the game keeps them."""
+        """Reverse obstacles that leave the arena, because they move straight."""
         edge = 0.5 * float(self.base.arena_side) + _EDGE
         obstacles = self._parts["obstacles"].copy()
         away = _distances(obstacles, self._parts["evader"]) > _CLEAR
@@ -213,18 +212,18 @@ class Session:
             obstacles[turns, 2 + axis] *= -1.0
         self._parts["obstacles"] = obstacles
 
-    # How messages change the world.
+    # Changes of the world by messages.
 
     def _begin(self, parts: dict[str, Any]) -> None:
-        """Go on from these parts of a world, which do not follow from what was."""
+        """Continue from these parts of a new world."""
         self._parts = parts
         self._held, self._count = np.zeros(2), 0
-        self.outcome, self._told, self._plan, self._waited = None, None, [], 0.0
+        self.outcome, self._output, self._plan, self._waited = None, None, [], 0.0
         self.score.restart()
         self._break()
 
     def _break(self) -> None:
-        """What comes does not follow from what was: the shield remembers nothing, the recording begins."""
+        """Reset the shield's memory and the recording after a discontinuity of the world."""
         self._memory, self._cut = None, True
         self._recording.restart()
 
@@ -262,7 +261,7 @@ class Session:
         self._break()
 
     def _touching(self) -> bool:
-        """Whether the robot is caught or has collided where everything is now."""
+        """Whether the robot is captured or collides in the current world."""
         evader, numbers = self._parts["evader"], self.numbers
         caught = _distances(self._parts["pursuers"], evader) <= numbers["capture_distance"]
         collided = _distances(self._parts["obstacles"], evader) <= numbers["collision_distance"]
@@ -310,19 +309,19 @@ class Session:
         """Control periods between two decisions of the policy."""
         return int(getattr(self.programs.policy, "decision_steps", 1))
 
-    # What the visitor is told.
+    # Data sent to the visitor.
 
     def frame(self) -> dict[str, Any]:
-        """The world as it stands, with the commands of the last period."""
+        """The current world, with the commands of the last period."""
         return self._frame_of(self._parts, 0.0)
 
     def _frame_of(self, parts: dict[str, Any], pace: float) -> dict[str, Any]:
-        """The world at the beginning of a period and the commands held in it; `pace` 0: it stands still.
+        """The world at the beginning of a period and the commands held in it; with `pace` 0 it stands still.
 
-        With these the page knows every robot's motion until the next frame exactly.
+        From these the page computes every robot's exact motion until the next frame.
         """
         self.frame_number += 1
-        told = self._told
+        output = self._output
         frame: dict[str, Any] = {
             "type": "frame",
             "frame": self.frame_number,
@@ -337,26 +336,26 @@ class Session:
             "score": self.score.to_dict(),
         }
         self._cut = False
-        if told is not None:
+        if output is not None:
             frame |= {
-                "action": _rounded(told["action"]),
-                "nominal": _rounded(np.nan_to_num(told["nominal"])),
-                "wheels": _rounded(told["wheels"]),
-                "h": _rounded(told["h"]),
-                "barriers": _rounded(np.nan_to_num(told["barriers"], neginf=0.0)),
-                "intervention": round(float(told["intervention"]), 5),
-                "status": Status.NAMES[int(told["status"])],
-                "reached": bool(told["reached"] > 0.0),
-                "looking": bool(told["looking"] > 0.0),
+                "action": _rounded(output["action"]),
+                "nominal": _rounded(np.nan_to_num(output["nominal"])),
+                "wheels": _rounded(output["wheels"]),
+                "h": _rounded(output["h"]),
+                "barriers": _rounded(np.nan_to_num(output["barriers"], neginf=0.0)),
+                "intervention": round(float(output["intervention"]), 5),
+                "status": Status.NAMES[int(output["status"])],
+                "reached": bool(output["reached"] > 0.0),
+                "looking": bool(output["looking"] > 0.0),
             }
             if self.show.rows:
-                frame["rows"] = _rounded(np.column_stack([told["normals"], told["offsets"]]))
+                frame["rows"] = _rounded(np.column_stack([output["normals"], output["offsets"]]))
             if self.show.plan:
                 frame["plan"] = self._plan
         return frame
 
     def setup(self) -> dict[str, Any]:
-        """What the visitor has chosen, and what it means; sent when it changes."""
+        """The visitor's choices and the resulting verdict; sent when they change."""
         return {
             "type": "setup",
             "shield": self.shield,
@@ -371,7 +370,7 @@ class Session:
         }
 
     def record(self) -> tuple[Recording, tuple[np.ndarray, np.ndarray], Scenario, dict[str, Any]]:
-        """What has been recorded of this episode, the scenario it was played in, and what to say about it."""
+        """The recording of this episode, its scenario, and its metadata."""
         about = {"shield": self.shield, "pursuer": self.pursuer, "source": "sidestep play"}
         return self._recording, self._recording.copy(), self.scenario, about
 

@@ -1,4 +1,4 @@
-"""Which numbers of the scenario may a visitor change, and within which bounds?"""
+"""The numbers of the scenario that a visitor may change, with their bounds."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from sidestep.safety.certificate.situation import plain
 from sidestep.world import Scenario
 
 PACES = (0.02, 4.0)
-"""Least and most seconds of the world in one second of the visitor's."""
+"""Least and largest number of simulated seconds per second."""
 YOU = "you"
-"""The pursuer that is the visitor."""
+"""The name of a pursuer driven by the visitor."""
 _TIP_ROOM = 0.3
-"""How far (m) from the tip of the capture set an episode starts at least."""
+"""Least distance (m) of a start from the tip of the capture set."""
 
 
 @dataclass(frozen=True)
 class Slider:
-    """One number: its name, what the page calls it, unit, bounds and step."""
+    """One number: its name, label, unit, bounds and step."""
 
     name: str
     label: str
@@ -47,11 +47,11 @@ SLIDERS = (
     _slider("collision_distance", "Obstacle's radius", 0.05, 0.5, 0.005),
     _slider("obstacle_speed", "Obstacle's speed", 0.0, 0.1, 0.005, field="obstacle_velocity"),
 )
-"""What the page offers. `obstacle_speed` is the magnitude of the scenario's `obstacle_velocity`."""
+"""The page's sliders. `obstacle_speed` is the magnitude of the scenario's `obstacle_velocity`."""
 
 
 def sliders_for(scenario: Scenario) -> dict[str, Slider]:
-    """The sliders by name, their bounds wide enough for the scenario's own numbers."""
+    """The sliders by name, with bounds that contain the scenario's numbers."""
     own = numbers_of(scenario)
     wide = {}
     for slider in SLIDERS:
@@ -61,7 +61,7 @@ def sliders_for(scenario: Scenario) -> dict[str, Slider]:
 
 
 def numbers_of(scenario: Scenario) -> dict[str, float]:
-    """Where the sliders stand for this scenario, SI units."""
+    """The sliders' values for this scenario, in SI units."""
     fields = {slider.name for slider in SLIDERS} - {"obstacle_speed"}
     numbers = {name: plain(getattr(scenario, name)) for name in fields}
     drift = [plain(component) for component in scenario.obstacle_velocity]
@@ -69,7 +69,7 @@ def numbers_of(scenario: Scenario) -> dict[str, float]:
 
 
 def with_numbers(scenario: Scenario, numbers: Mapping[str, float]) -> Scenario:
-    """The scenario with the sliders at `numbers`; new starts are kept clear of what has become larger."""
+    """The scenario with these slider values; separations of starts grow with the distances."""
     fields = {name: value for name, value in numbers.items() if name != "obstacle_speed"}
     changed = _replaced(scenario, fields)
     if "obstacle_speed" in numbers:
@@ -101,7 +101,7 @@ def _replaced(scenario: Scenario, fields: Mapping[str, Any]) -> Scenario:
 
 
 def _rescaled(velocity: Any, speed: float) -> Any:
-    """`velocity` (n, 2) or (2,) turned to this speed (m/s); along +x where it was at rest."""
+    """`velocity` (n, 2) or (2,) scaled to this speed (m/s); along +x if it was zero."""
     velocity = np.asarray(velocity, float)
     length = np.hypot(velocity[..., 0], velocity[..., 1])[..., None]
     ahead = np.zeros_like(velocity)
@@ -110,5 +110,5 @@ def _rescaled(velocity: Any, speed: float) -> Any:
 
 
 def drifts_at(velocities: Any, speed: float) -> Any:
-    """Velocities (k, 2) of obstacles, each at this speed (m/s) in the direction it had."""
+    """Velocities (k, 2) of obstacles scaled to this speed (m/s)."""
     return _rescaled(velocities, speed)

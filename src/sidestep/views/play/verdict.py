@@ -1,4 +1,4 @@
-"""Can the robot be caught with these numbers? What can be told at once."""
+"""Whether the robot can be captured with the given numbers, as far as it is fast to compute."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from sidestep.safety.certificate.sampled_game import SampledGame
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known about capture with these numbers.
+    """Whether capture is possible with these numbers.
 
     - `kind`: `caught` (the best pursuer wins), `held` (the certificate holds at this control period), or
-      `open` (the evader wins the game, but nothing is certified for one that decides once per period);
-      `unsure` while the last two have not been told apart yet
+      `open` (the evader wins the game in continuous time, but there is no certificate at this control
+      period); `unsure` before the certificate has been computed
     - `largest` l_max and `margin` l_max - l, m; infinite for an evader at least as fast
     """
 
@@ -26,7 +26,7 @@ class Verdict:
     margin: float
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values; infinite lengths become None."""
+        """JSON values; infinite lengths become None."""
         finite = math.isfinite(self.largest)
         return {
             "kind": self.kind,
@@ -36,16 +36,17 @@ class Verdict:
 
 
 def quick_verdict(numbers: Mapping[str, float], period: float) -> Verdict:
-    """The game's own test, l <= l_max = b rho^2/sqrt(1 - rho^2) (see `CaptureGame`), in no time."""
+    """The game's test, l <= l_max = b rho^2/sqrt(1 - rho^2), see `CaptureGame`; fast."""
     game = _game(numbers, period)
-    largest, wanted = game.largest_capture_distance, numbers["capture_distance"]
-    return Verdict("caught" if wanted > largest else "unsure", largest, largest - wanted)
+    largest, distance = game.largest_capture_distance, numbers["capture_distance"]
+    return Verdict("caught" if distance > largest else "unsure", largest, largest - distance)
 
 
 def verdict(numbers: Mapping[str, float], period: float, pursuers: int) -> Verdict:
-    """`quick_verdict`, and whether the certificate of `sidestep certify` holds at this period: some 20 ms.
+    """`quick_verdict`, and whether the certificate of `sidestep certify` holds at this period; about 20 ms.
 
-    Against exact measurements and one pursuer in the unbounded plane; nothing is held against several.
+    For exact measurements and one pursuer in the unbounded plane; there is no certificate for several
+    pursuers.
     """
     quick = quick_verdict(numbers, period)
     if quick.kind == "caught":

@@ -1,4 +1,4 @@
-"""One visitor's connection: messages in, frames out, neither waiting for the other."""
+"""One visitor's connection: receives messages and sends frames, independently of each other."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from sidestep.views.play.messages import Drive, Message, MessageError, Seen
 from sidestep.views.play.session import Session
 
 _ENDING = 1.8
-"""s between the end of an episode and the next."""
+"""Time (s) between the end of an episode and the next."""
 _SETTLE = 0.25
-"""s without another number before what takes a while is found out about the last."""
+"""Time (s) without a new number after which the slow part of the verdict is computed."""
 _IDLE = 0.1
-"""s between two looks at a world that stands still."""
+"""Time (s) between two frames of a world that stands still."""
 _LATE = 0.25
-"""s by which a period may be late before the clock stops trying to make up for it."""
+"""Lateness (s) of a period beyond which the clock does not catch up."""
 _FLOOD_PAUSE = 0.02
-"""s for which a visitor is not listened to after every 50 messages too many."""
+"""Time (s) for which no messages are received after every 50 excess messages."""
 
 
 class Gone(Exception):
-    """The visitor has gone."""
+    """The connection has ended."""
 
 
 @final
-class Allowance:
-    """A bucket that fills with `rate` tokens per second up to `burst`; each message takes one."""
+class TokenBucket:
+    """Rate limiter: fills with `rate` tokens per second up to `burst`; each message takes one."""
 
     def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic):
         self._rate, self._burst, self._clock = rate, float(burst), clock
@@ -52,11 +52,10 @@ class Allowance:
 
 @final
 class Outbox:
-    """What is to be sent: a few notes in order, and the latest frame, which replaces the one before it.
+    """Outgoing data: a few notes in order, and the latest frame, which replaces the one before it.
 
-    A frame waits while `ahead` of them have been sent and not been acknowledged: so what a slow connection
-    carries is at most that old, however slow it is. A visitor that never acknowledges any is sent all that
-    the connection takes.
+    A frame waits while `ahead` frames are not acknowledged, which bounds the latency of a slow connection. A
+    visitor that never acknowledges gets as many frames as the connection can carry.
     """
 
     def __init__(self, ahead: int, notes: int = 32):
@@ -68,7 +67,8 @@ class Outbox:
         self._changed = asyncio.Event()
 
     def put(self, frame: dict[str, Any]) -> None:
-        """The latest frame. A break in time and a target reached are not lost with the one before."""
+        """Set the latest frame. The flags of the replaced frame (a discontinuity, a reached target) are
+        kept."""
         if self._frame is not None:
             frame["cut"] = frame["cut"] or self._frame["cut"]
             if self._frame.get("reached"):
@@ -77,7 +77,7 @@ class Outbox:
         self._changed.set()
 
     def note(self, note: dict[str, Any]) -> None:
-        """Something else; one setup replaces another, and of too many notes the oldest go."""
+        """Add a note. A setup replaces a waiting setup, and of too many notes the oldest are dropped."""
         if note["type"] == "setup":
             others = [other for other in self._notes if other["type"] != "setup"]
             self._notes.clear()
@@ -86,7 +86,7 @@ class Outbox:
         self._changed.set()
 
     def acknowledge(self, frame: int) -> None:
-        """The visitor has this frame."""
+        """Register that the visitor has this frame."""
         if self._sent:
             self._seen = max(self._seen, min(frame, self._sent[-1]))
         while len(self._sent) > 1 and self._sent[0] <= self._seen:
@@ -95,11 +95,11 @@ class Outbox:
 
     @property
     def acknowledged(self) -> bool:
-        """Whether the visitor acknowledges at all."""
+        """Whether the visitor acknowledges frames."""
         return self._seen >= 0
 
     async def take(self) -> dict[str, Any]:
-        """What to send next, once there is something."""
+        """Wait for the next data to send."""
         while True:
             if self._notes:
                 return self._notes.popleft()
@@ -112,7 +112,7 @@ class Outbox:
 
     @property
     def _behind(self) -> bool:
-        """Whether as many frames as allowed are on their way."""
+        """Whether the number of unacknowledged frames is at its limit."""
         if self._seen < 0:
             return False
         return sum(number > self._seen for number in self._sent) >= self._ahead
@@ -122,10 +122,10 @@ class Outbox:
 class Visitor:
     """Runs a session at its pace until the connection ends.
 
-    All that computes runs in `workers`, never in the event loop. Messages that come too fast are dropped
-    unread; edits wait for the next period, a few at most; what the visitor drives at takes effect at once.
+    Computations run in `workers`, never in the event loop. Messages that arrive too fast are dropped unread;
+    edits wait for the next period, with a limit; drive commands take effect at once.
 
-    **Arguments:** `receive` the next text message, raising `Gone` when there is none any more; `send` one.
+    **Arguments:** `receive` returns the next text message, and raises `Gone` at the end; `send` sends one.
     """
 
     def __init__(
@@ -138,16 +138,16 @@ class Visitor:
     ):
         self.session, self._limits, self._workers = session, limits, workers
         self._receive, self._send = receive, send
-        self._allowance = Allowance(limits.message_rate, limits.message_burst)
-        self._complaints = Allowance(2.0, 5)
+        self._allowance = TokenBucket(limits.message_rate, limits.message_burst)
+        self._complaints = TokenBucket(2.0, 5)
         self._edits: deque[Message] = deque()
         self._asked = asyncio.Event()
         self._outbox = Outbox(limits.frames_ahead)
         self._heard = time.monotonic()
-        self._told_setup: dict[str, Any] | None = None
+        self._last_setup: dict[str, Any] | None = None
 
     async def run(self, greeting: dict[str, Any]) -> None:
-        """Greet, and go on until the connection ends or one of the parts fails."""
+        """Run until the connection ends or a task fails."""
         self._outbox.note(greeting)
         parts = [asyncio.ensure_future(part()) for part in (self._listen, self._live, self._speak)]
         try:
@@ -169,7 +169,7 @@ class Visitor:
             if not self._allowance.take():
                 dropped += 1
                 if dropped % 50 == 0:
-                    # Who floods is heard less: the connection fills up, and only theirs.
+                    # Slow down a flooding visitor: only their connection fills up.
                     await asyncio.sleep(_FLOOD_PAUSE)
                 continue
             try:
@@ -200,7 +200,7 @@ class Visitor:
             await self._send(json.dumps(note, separators=(",", ":"), allow_nan=False))
 
     async def _live(self) -> None:
-        """The clock: what was asked, then one period, and so on."""
+        """The clock: apply edits, then advance by one period, repeatedly."""
         session, loop = self.session, asyncio.get_running_loop()
         due, settle_at, ended = loop.time(), loop.time() + _SETTLE, None
         self._say(session.frame())
@@ -247,11 +247,11 @@ class Visitor:
         return self.session.frame(), complaints
 
     async def _wait(self, seconds: float) -> None:
-        """Until then, or until something is asked."""
+        """Wait until that time, or until an edit arrives."""
         self._asked.clear()
         if self._edits:
             return
-        # Not wait_for: before Python 3.12 it drops a cancellation that comes with what it waits for.
+        # Not wait_for: before Python 3.12 it may lose a cancellation.
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._asked.wait()
@@ -261,8 +261,8 @@ class Visitor:
 
     def _say_setup(self) -> None:
         setup = self.session.setup()
-        if setup != self._told_setup:
-            self._told_setup = setup
+        if setup != self._last_setup:
+            self._last_setup = setup
             self._outbox.note(setup)
 
     def _watch_silence(self) -> None:

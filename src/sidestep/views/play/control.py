@@ -1,4 +1,4 @@
-"""Who drives the pursuers: a strategy, or the visitor?"""
+"""Control of the pursuers by a strategy, or of the first one by the visitor."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
 STRATEGIES = tuple(PURSUERS)
-"""Names of the strategies, by number."""
+"""Names of the strategies; a strategy's number is its index."""
 BY_STRATEGY, BY_WHEELS, BY_POINT = 0.0, 1.0, 2.0
-"""How the first pursuer is driven: by its strategy; by given wheel speeds, as shares of the highest; or
-straight at a given point, m."""
+"""How the first pursuer is driven: by its strategy; by commanded wheel speeds, as shares of the largest; or
+to a commanded point, m."""
 
 
 @final
-class Helm(eqx.Module):
-    """A strategy for all pursuers that takes the visitor's word for the first.
+class PursuerControl(eqx.Module):
+    """A strategy for all pursuers, which the visitor's command may override for the first one.
 
-    `strategy ()` is a number in `STRATEGIES`; `mode ()` and `wanted (2,)` say how the first one is driven.
-    All are traced: another pursuer never recompiles. `key` is for strategies that draw.
+    `strategy ()` is an index of `STRATEGIES`; `mode ()` and `command (2,)` determine how the first one is
+    driven. All are traced: another pursuer never recompiles. `key` is for strategies that draw random
+    numbers.
     """
 
     strategy: Array
     mode: Float[Array, ""]
-    wanted: Float[Array, "2"]
+    command: Float[Array, "2"]
     key: PRNGKeyArray
 
     def steer_all(self, scenario: Scenario, world: World) -> Float[Array, "m 2"]:
@@ -45,7 +46,7 @@ class Helm(eqx.Module):
         wheels = jax.lax.switch(self.strategy, [branch(name) for name in STRATEGIES])
         limit = scenario.pursuer_speed
         driven = jnp.where(
-            self.mode == BY_WHEELS, limit * jnp.clip(self.wanted, -1.0, 1.0), self._to_point(scenario, world)
+            self.mode == BY_WHEELS, limit * jnp.clip(self.command, -1.0, 1.0), self._to_point(scenario, world)
         )
         return wheels.at[0].set(jnp.where(self.mode == BY_STRATEGY, wheels[0], driven))
 
@@ -54,8 +55,8 @@ class Helm(eqx.Module):
         return self.steer_all(scenario, world)[0]
 
     def _to_point(self, scenario: Scenario, world: World) -> Float[Array, "2"]:
-        """Turn the nearer end to the point, drive to it, and stop there."""
-        z = to_pursuer_frame(self.wanted, world.pursuer)
+        """Wheel speeds (m/s) that turn the nearer end to the point, drive to it, and stop there."""
+        z = to_pursuer_frame(self.command, world.pursuer)
         end, turn = nearer_end(bearing_of(z))
         wheels = turn_and_drive(
             turn, end, scenario.pursuer_speed, scenario.pursuer_half_axle, scenario.control_period

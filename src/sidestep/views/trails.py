@@ -1,4 +1,4 @@
-"""The ways that everybody in an episode has taken, up to any time of it."""
+"""The trails of all robots up to any time of an episode."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sidestep.world import Scenario
 
 _RECENT_SECONDS = 5.0
 _FINEST = 0.025
-"""Seconds: the ways bend at least so often."""
+"""Largest time step (s) of a trail."""
 
 
 @final
-class Ways:
-    """The ways taken, up to any time, in the world and as every pursuer sees them."""
+class Trails:
+    """Trails up to any time, in the world and in every pursuer's frame."""
 
     def __init__(self, scenario: Scenario, trajectory: Trajectory, motion: Motion):
         self._parts = max(1, int(np.ceil(motion.period / _FINEST)))
@@ -38,20 +38,20 @@ class Ways:
 
     @property
     def distances(self) -> Float[np.ndarray, "n"]:
-        """From the pursuer that is looked from to the evader, m."""
+        """Distances (m) of the evader from the pursuer whose frame is shown."""
         seen = self._seen[np.arange(len(self._viewers)), self._viewers]
         return np.hypot(seen[:, 0], seen[:, 1])
 
     def _passed(self, time: float) -> int:
-        """How many of the times are over."""
+        """Number of `times` up to `time`."""
         return int(np.searchsorted(self.times, time + 1e-9, side="right"))
 
     def viewer(self, time: float) -> int:
-        """The pursuer from which to look."""
+        """The pursuer whose frame is shown."""
         return int(self._viewers[self._passed(time) - 1])
 
     def in_world(self, now: Instant) -> tuple[Any, ...]:
-        """What `MovingPanel.show_trails` takes, in the world."""
+        """Arguments of `MovingPanel.show_trails` in the world's frame."""
         count = self._passed(now.time)
         upto = lambda path, place: np.concatenate([path[:count], place[None]])  # noqa: E731
         others = [
@@ -64,19 +64,19 @@ class Ways:
         return evader, np.zeros((0, 2)), others, *self._pieces(self._evader, 0, count)
 
     def seen_by(self, pursuer: int, now: Instant) -> tuple[Any, ...]:
-        """The same as this pursuer sees it, of late; what was before is faint."""
+        """Arguments of `MovingPanel.show_trails` in this pursuer's frame; the older part is faint."""
         count = self._passed(now.time)
         recent = max(0, count - round(_RECENT_SECONDS / self._period) * self._parts)
-        way = self._seen[:, pursuer]
+        path = self._seen[:, pursuer]
         return (
-            np.concatenate([way[recent:count], now.evader[None]]),
-            way[: recent + 1],
+            np.concatenate([path[recent:count], now.evader[None]]),
+            path[: recent + 1],
             [],
-            *self._pieces(way, recent, count),
+            *self._pieces(path, recent, count),
         )
 
-    def _pieces(self, way: np.ndarray, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """The pieces between two times in which the shield stepped in, with their colours."""
+    def _pieces(self, path: np.ndarray, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The pieces between two times with an intervention, and their colours."""
         begin, end = np.searchsorted(self._corrected, [first, count - 1])
         pieces = self._corrected[begin:end]
-        return np.stack([way[pieces], way[pieces + 1]], axis=1), self._colours[begin:end]
+        return np.stack([path[pieces], path[pieces + 1]], axis=1), self._colours[begin:end]
