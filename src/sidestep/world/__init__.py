@@ -1,4 +1,4 @@
-"""What exists and how it moves: robots, world state, scenario, observation, reward and events."""
+"""Robots, world state, scenario, observation, reward and events."""
 
 from sidestep.world.events import Events
 from sidestep.world.field_names import ALIASES, ScenarioError, without_aliases

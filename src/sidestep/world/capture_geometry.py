@@ -1,4 +1,4 @@
-"""The region in which a differential-drive pursuer captures at once, seen in its own frame."""
+"""The capture set: where a differential-drive pursuer captures by driving straight, in its frame."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,7 +16,7 @@ def to_pursuer_frame(
 
 
 def usable_angle(evader_speed: Float[AnyArray, ""], pursuer_speed: Float[AnyArray, ""]) -> Scalar:
-    """S = arccos(min(v_e/V, 1)): contact beyond this angle from the pursuer's axis cannot be forced."""
+    """S = arccos(min(v_e/V, 1)), rad: contact at larger angles to the pursuer's axis cannot be forced."""
     return jnp.arccos(jnp.clip(evader_speed / pursuer_speed, 0.0, 1.0))
 
 
@@ -27,7 +27,7 @@ def capture_set_distance(
 
     beta' is the angle between z and the pursuer's axis, front or rear. K is the convex hull of the
     disc of radius l and the two points (+-l/rho, 0): inside it the pursuer captures by driving
-    straight, whatever the evader does (Ruiz, Murrieta-Cid, Marroquin, IEEE T-RO 2013). Outside the
+    straight, for any motion of the evader (Ruiz, Murrieta-Cid, Marroquin, IEEE T-RO 2013). Outside the
     usable angle h is the range, inside it the distance to a tangent line,
     h = |x| cos S + |y| sin S - l.
     """

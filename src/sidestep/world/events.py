@@ -1,4 +1,4 @@
-"""What happened during one control period."""
+"""The events of one control period."""
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
@@ -7,10 +7,9 @@ from jaxtyping import Array, Bool, Float
 class Events(eqx.Module):
     """Outcome of one control period; every field has the batch shape of the worlds stepped.
 
-    `captured` and `collided` are contacts at any instant of the period, not only at its end, and may
-    both be true. `reached` needs neither; `timed_out` needs none of the three. Clearances (m) are the
-    smallest distances of the period less the capture or collision distance, infinite when there is no
-    such robot.
+    `captured` and `collided` are contacts at any time in the period, not only at its end, and may both be
+    true. `reached` implies neither of them, and `timed_out` none of the three. Clearances (m) are the least
+    distances in the period less the capture or collision distance, infinite without such a robot.
     """
 
     reward: Float[Array, "*batch"]
@@ -23,10 +22,10 @@ class Events(eqx.Module):
 
     @property
     def terminated(self) -> Bool[Array, "*batch"]:
-        """The episode ended by something that happened; its value beyond is zero."""
+        """The episode ended by capture, collision or reaching the target; the next value is zero."""
         return self.captured | self.collided | self.reached
 
     @property
     def truncated(self) -> Bool[Array, "*batch"]:
-        """The episode was cut by the time limit; learners must bootstrap through it."""
+        """The episode was ended by the time limit; learners must bootstrap through it."""
         return self.timed_out

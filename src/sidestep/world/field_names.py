@@ -1,4 +1,4 @@
-"""Which scenario field is meant? Names that data sheets use, as aliases or as advice in the error."""
+"""Names that data sheets use for scenario fields, as aliases or as hints in error messages."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class ScenarioError(ValueError):
 
 
 ALIASES: dict[str, tuple[str, float]] = {"wheel_separation": ("pursuer_half_axle", 0.5)}
-"""Alias -> field, and what its value is multiplied by."""
+"""Alias -> field, and the factor on its value."""
 
 _SPEEDS = (
-    "say whose: 'evader_speed' (in every direction) or 'pursuer_speed' (the most that a wheel's rim makes, "
+    "say whose: 'evader_speed' (in every direction) or 'pursuer_speed' (the largest rim speed of a wheel, "
     "|v| + b|omega|)"
 )
 _TRACK = "the distance between a pursuer's left and right wheels is 'wheel_separation'"
@@ -25,12 +25,12 @@ _SIZE = (
     "'collision_distance' (evader and obstacle)"
 )
 _TURNING = (
-    "a differential drive turns at up to 'pursuer_speed' / 'pursuer_half_axle'; robots with a limit of their "
-    "own are covered by a larger 'pursuer_speed', see docs/certificate.md"
+    "a differential drive turns at up to 'pursuer_speed' / 'pursuer_half_axle'; other robots are covered "
+    "by a larger 'pursuer_speed', see docs/certificate.md"
 )
 _PERIOD = "the time between two decisions is 'control_period', in s"
 _ERRORS = (
-    "what is measured and how late is no part of a scenario: it is an option of certify (--position-error, "
+    "errors and delays are not part of a scenario: they are options of certify (--position-error, "
     "--heading-error, --delay, --tracking-error) and of sidestep.safety.Budget"
 )
 _ADVICE = {
@@ -47,7 +47,7 @@ _ADVICE = {
             "wheel_speed", "rim_speed", "max_wheel_speed", "wheel_velocity", "pursuer_max_speed",
             "pursuer_velocity", "pursuer_top_speed",
         ),
-        "the most that a rim of the pursuer's wheels makes is 'pursuer_speed'",
+        "the largest rim speed of the pursuer's wheels is 'pursuer_speed'",
     ),
     **dict.fromkeys(
         ("evader_max_speed", "evader_velocity", "evader_top_speed", "robot_speed"),
@@ -62,7 +62,7 @@ _ADVICE = {
     ),
     **dict.fromkeys(
         ("wheelbase", "wheel_base"),
-        f"{_TRACK}, if that is meant; the distance from front to rear axle plays no part",
+        f"{_TRACK}, if that is meant; the distance from front to rear axle is not used",
     ),
     **dict.fromkeys(
         (
@@ -96,15 +96,15 @@ _ADVICE = {
         "the square that starts and targets are drawn in is 'arena_side'",
     ),
 }  # fmt: skip
-"""What to say of a name that is no field but that people will try: no spelling is near to what it means."""
+"""Hints for common names that are not fields and whose spelling is not near to the right field."""
 
 
 def without_aliases(values: Mapping[str, Any], *, zero: bool = False) -> dict[str, Any]:
-    """`values` with fields in the place of aliases: `wheel_separation=0.16` is `pursuer_half_axle=0.08`.
+    """`values` with aliases replaced by fields: `wheel_separation=0.16` becomes `pursuer_half_axle=0.08`.
 
-    **Arguments:** `zero` whether 0 is allowed (only a certificate can do with it).
+    **Arguments:** `zero` whether 0 is allowed (for certificates only).
 
-    **Raises** `ScenarioError` for a value that is no number above 0, or an alias beside its field.
+    **Raises** `ScenarioError` for a value that is not a number above 0, or an alias together with its field.
     """
     plain = dict(values)
     for alias, (field, factor) in ALIASES.items():
@@ -113,8 +113,8 @@ def without_aliases(values: Mapping[str, Any], *, zero: bool = False) -> dict[st
         value = plain.pop(alias)
         if field in plain:
             raise ScenarioError(
-                f"'{alias}' = {value!r} and '{field}' = {plain[field]!r} are both given, and both say the "
-                f"same ('{field}' is {factor:g} times '{alias}'): give one of them"
+                f"'{alias}' = {value!r} and '{field}' = {plain[field]!r} are both given, but they are "
+                f"equivalent ('{field}' is {factor:g} times '{alias}'): give one of them"
             )
         bound = Bound(least=0.0) if zero else Bound(above=0.0)
         try:
@@ -125,7 +125,7 @@ def without_aliases(values: Mapping[str, Any], *, zero: bool = False) -> dict[st
 
 
 def unknown_field(name: str, known: Iterable[str]) -> str:
-    """What to say of a name that is neither a field nor an alias."""
+    """The error message for a name that is neither a field nor an alias."""
     names = sorted([*known, *ALIASES])
     meant = _ADVICE.get(name.lower().replace("-", "_"))
     hint = f": {meant}." if meant else did_you_mean(name, names)

@@ -1,4 +1,4 @@
-"""Robots that fly at one height: a quadrotor that is told velocities, and an aircraft that turns slowly."""
+"""Robots that fly at constant height: a quadrotor with velocity commands, and an aircraft with wide turns."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ _NEWTON_STEPS = 8
 
 @final
 class Quadrotor(EvaderModel):
-    """A quadrotor whose autopilot turns velocities into a motion that the airframe can follow.
+    """A quadrotor with an autopilot that turns commanded velocities into a motion that the airframe follows.
 
-    With the velocity u told, the motion asked of the airframe is
+    For the commanded velocity u this reference motion is
 
         a' = ((u - v)/tau - a)/T,   v' = a,   p' = v,
 
-    tau being the time constant of the velocity loop and T that of the attitude, which stands for the
-    acceleration. The control point p + tau v + tau T a moves as told, and is never farther from p than
-    tau v_e as long as it has been told no more than v_e (the response from its motion to that difference has
-    no overshoot for tau > 4 T). What the airframe lags behind this motion is a position error, see
-    `sidestep.plants.air`.
+    with tau the time constant of the velocity loop and T that of the attitude loop. The control point
+    p + tau v + tau T a moves with velocity u. Its distance from p is at most tau v_e for |u| <= v_e (the
+    response from u to that difference has no overshoot for tau > 4 T). The airframe's deviation from this
+    motion is a position error, see `sidestep.plants.air`.
 
     **Raises** `ValueError` for time constants that are not above 0, or tau <= 4 T.
     """
@@ -49,25 +48,25 @@ class Quadrotor(EvaderModel):
             )
 
     def _rates(self) -> tuple[Scalar, Scalar]:
-        """The two rates (1/s, negative) at which the velocity settles."""
+        """The two eigenvalues (1/s, negative) of the velocity's dynamics."""
         tau, lag = real(self.time_constant), real(self.attitude_lag)
         root = jnp.sqrt(tau * tau - 4.0 * tau * lag)
         return (root - tau) / (2.0 * tau * lag), -(root + tau) / (2.0 * tau * lag)
 
     def largest_acceleration(self, scenario: Scenario) -> Scalar:
-        """The most (m/s^2) that any sequence of velocities up to v_e makes it accelerate: 2 v_e times the
-        peak of the response of v to an impulse of u."""
+        """The largest acceleration (m/s^2) under any commands up to v_e: 2 v_e times the peak of the response
+        of v to an impulse of u."""
         slow, fast = self._rates()
         when = jnp.log(fast / slow) / (slow - fast)
         peak = slow * fast / (slow - fast) * (jnp.exp(slow * when) - jnp.exp(fast * when))
         return 2.0 * scenario.evader_speed * peak
 
     def largest_tilt(self, scenario: Scenario) -> Scalar:
-        """The tilt (rad) that the largest acceleration takes at constant height."""
+        """The tilt (rad) at the largest acceleration and constant height."""
         return jnp.arctan(self.largest_acceleration(scenario) / GRAVITY)
 
     def start(self, scenario: Scenario, key: PRNGKeyArray) -> Float[Array, "2"]:
-        """It hovers: acceleration (m/s^2) 0."""
+        """Hovering: acceleration (m/s^2) 0."""
         return jnp.zeros(2, dtype=float)
 
     def after(
@@ -94,10 +93,10 @@ class Quadrotor(EvaderModel):
 
 @final
 class Aircraft(PursuerModel):
-    """Flies forwards at `slowest` V to V, on arcs of `turning_radius` (m) or more.
+    """Flies forwards at speeds from `slowest` V to V, on arcs of `turning_radius` (m) or more.
 
-    Shields guard against the differential drive that can do all this and leaves the largest capture distance:
-    b = (y - 1) R and V' = y V, with y the root of y^3 - 2 y^2 + (v_e/V)^2 = 0 between 1.6 and 2.
+    Shields assume the covering differential drive with the largest l_max: b = (y - 1) R and V' = y V, with y
+    the root of y^3 - 2 y^2 + (v_e/V)^2 = 0 between 1.6 and 2.
 
     **Raises** `ValueError` for a radius that is not above 0, or a share outside [0, 1].
     """
@@ -105,7 +104,7 @@ class Aircraft(PursuerModel):
     turning_radius: float = bounded(4.0, above=0.0, unit="m")
     """R, m."""
     slowest: float = bounded(0.5, least=0.0, most=1.0)
-    """Least speed, as a share of V."""
+    """Least speed as a share of V."""
 
     def __check_init__(self):
         check(self)

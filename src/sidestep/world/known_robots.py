@@ -1,12 +1,12 @@
-"""What can robots that are on sale do, by their makers' figures, and what does the model make of that?
+"""Robots on sale: their makers' figures, converted to fields of a scenario.
 
-A figure of `known_robots.toml` becomes a number of the scenario only where the robot can certainly do no more
-(pursuers) or certainly do as much (evaders), so that what is guaranteed in the model is not too much:
+The conversion of a figure of `known_robots.toml` is conservative: an upper bound of what a pursuer can do, a
+lower bound for an evader. Guarantees for the model then hold for the robot.
 
-- A differential drive in the model takes every |v| + b|omega| <= V. Where the most that a wheel's rim makes
-  is known, V is that, at least the top speed and at least b times the top turn rate. Elsewhere both limits
-  are taken to be reached together, and V = v_max + b omega_max covers that, whatever b.
-- An evader in the model moves as fast in every direction. Mecanum wheels that make s straight ahead allow
+- A differential drive in the model can do every |v| + b|omega| <= V. If the largest rim speed of a wheel is
+  known, V is the largest of it, the top speed and b times the top turn rate. Otherwise both limits are
+  assumed to be reached together, V = v_max + b omega_max, for any b.
+- An evader in the model is equally fast in every direction. Mecanum wheels with speed s straight ahead allow
   |v_x| + |v_y| <= s, so s/sqrt(2) in every direction.
 """
 
@@ -25,10 +25,10 @@ from sidestep.world.field_names import ScenarioError
 ROLES = ("pursuer", "evader")
 
 _IN_EVERY_DIRECTION = {"mecanum": math.sqrt(0.5)}
-"""The share of the printed speed that a drive makes in every direction."""
+"""The share of the printed speed that a drive reaches in every direction."""
 
 _SEPARATION, _ARENA = 3.0, 15.0
-"""Distance of random starts, and side of their square, over the capture distance: as in the paper."""
+"""Separation of random starts, and side of their square, over the capture distance, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class KnownRobot:
     """One robot of `known_robots.toml`. SI units.
 
     - `role` `"pursuer"` or `"evader"`; `drive` of an evader
-    - `radius` (m) of the circle about the tracked point that holds its outline
-    - `figures` each with `value`, `sources` and, where it is not simply printed, `how` it was found
-    - `unknown` what no source says
+    - `radius` (m) of the circle about the tracked point that contains its outline
+    - `figures` each with `value`, `sources` and, if it is not printed directly, `how` it was found
+    - `unknown` figures that no source states
     """
 
     name: str
@@ -49,7 +49,7 @@ class KnownRobot:
     unknown: str
 
     def figure(self, name: str) -> float:
-        """A figure's value; `KeyError` where there is none."""
+        """A figure's value. **Raises** `KeyError` for an unknown figure."""
         return self.figures[name]["value"]
 
     @property
@@ -114,7 +114,7 @@ def known_robots() -> dict[str, KnownRobot]:
 
 
 def find_robot(name: str, role: str) -> KnownRobot:
-    """The robot of that name. **Raises** `ScenarioError` where there is none, or none of that role."""
+    """The robot of that name. **Raises** `ScenarioError` for an unknown name, or a robot of another role."""
     named = {robot.name: robot for robot in known_robots().values() if robot.role == role}
     if name not in named:
         other = known_robots().get(name)
@@ -124,12 +124,12 @@ def find_robot(name: str, role: str) -> KnownRobot:
 
 
 def robot_fields(pursuer: str | None = None, evader: str | None = None) -> dict[str, Any]:
-    """Fields of robots that are on sale: `load_scenario("paper", **robot_fields("create3", "dingo-o"))`.
+    """Scenario fields of robots on sale: `load_scenario("paper", **robot_fields("create3", "dingo-o"))`.
 
-    With both, capture is contact, so the capture distance is the sum of their radii (m, between centres), and
-    random starts are as far apart for it as in the paper. All else stays the scenario's, obstacles too.
+    With both robots, the capture distance is the sum of their radii (m), and separations of random starts are
+    in the same ratio to it as in the paper. Other fields, such as obstacles, do not change.
 
-    **Raises** `ScenarioError` for a name that is not known, or that is the other's.
+    **Raises** `ScenarioError` for an unknown name, or a robot of the other role.
     """
     robots = [find_robot(name, role) for role, name in zip(ROLES, (pursuer, evader), strict=True) if name]
     fields = {key: value for robot in robots for key, value in robot.fields.items()}

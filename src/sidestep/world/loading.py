@@ -1,4 +1,4 @@
-"""Scenarios by name or from a file, validated before anything runs."""
+"""Load scenarios by name or from a file, and validate them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _QUADROTOR: dict[str, Any] = {
     "pursuer_model": Aircraft(),
     "evader_speed": 0.8,
     "pursuer_speed": 1.0,
-    # What strategies answer wheel speeds for; the aircraft has no axle.
+    # Strategies return wheel speeds for this half axle; the aircraft has no axle.
     "pursuer_half_axle": 1.0,
     "capture_distance": 0.17,
     "collision_distance": 0.2,
@@ -51,9 +51,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pursuer_starts": ((1.0, -0.5, 0.0),),
         "target_start": (2.5, 0.0),
     },
-    # A small quadrotor among columns, chased by a faster aircraft that turns slowly.
+    # A small quadrotor among columns, pursued by a faster aircraft with wide turns.
     "quadrotor": _QUADROTOR,
-    # One scene of that kind: the aircraft comes head-on, and columns stand to both sides of the way.
+    # A fixed scene of that kind: the aircraft comes head-on, with columns on both sides of the path.
     "quadrotor-test": {
         **_QUADROTOR,
         "evader_start": (0.0, 0.0),
@@ -74,7 +74,7 @@ def _fail(field: str, value: object, allowed: str) -> None:
 
 
 def _check_scene(scenario: Scenario) -> None:
-    """Conflicts between fixed starts, each named."""
+    """**Raises** `ScenarioError` for fixed starts that conflict."""
     evader, target = scenario.evader_start, scenario.target_start
     if scenario.obstacle_starts is not None:
         for obstacle in scenario.obstacle_starts:
@@ -117,26 +117,26 @@ def _names_of(field: str) -> list[str]:
 
 
 def _model(field: str, value: Any) -> Any:
-    """A model, None, or what a file names: `"quadrotor"`, or `{model = "quadrotor", time_constant = 0.3}`."""
-    told = {"model": value} if isinstance(value, str) else value
-    if not isinstance(told, Mapping) or told.get("model") not in _names_of(field):
+    """A model, None, or a name in a file: `"quadrotor"`, or `{model = "quadrotor", time_constant = 0.3}`."""
+    entry = {"model": value} if isinstance(value, str) else value
+    if not isinstance(entry, Mapping) or entry.get("model") not in _names_of(field):
         if not isinstance(value, (_MODELS[field], type(None))):
             _fail(
                 field,
                 value,
                 f"it must be a {_MODELS[field].__name__}, or None for the built-in robot, or by name "
-                f"({', '.join(_names_of(field))}). One of your own is code: give it to load_scenario "
-                "beside the file",
+                f"({', '.join(_names_of(field))}). A custom model is code: pass it to load_scenario as an "
+                "argument",
             )
         return value
-    kind = _NAMED[told["model"]]
+    kind = _NAMED[entry["model"]]
     numbers, known = (
-        {name: told[name] for name in told if name != "model"},
+        {name: entry[name] for name in entry if name != "model"},
         [one.name for one in fields(kind)],
     )
     for name in numbers:
         if name not in known:
-            _fail(field, value, f"a {told['model']} has no '{name}'; it has {', '.join(known)}")
+            _fail(field, value, f"a {entry['model']} has no '{name}'; it has {', '.join(known)}")
     try:
         return kind(**check(kind, numbers))
     except ValueError as error:
@@ -188,12 +188,12 @@ def _some_start_exists(scenario: Scenario) -> jax.Array:
 def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
     """A validated scenario: a preset (a key of `PRESETS`) or a TOML or JSON file, with overrides.
 
-    A file holds fields of `Scenario`; an optional `preset` names the one it starts from (`paper`
-    otherwise). A run's `config.json` can be given too: its `scenario` entry is used. Reducing
-    `obstacle_count` or `pursuer_count` below the fixed starts keeps the first ones. The robots that fly are
-    known by name, in files too: `evader_model = "quadrotor"`, `pursuer_model = {model = "aircraft",
-    turning_radius = 3.0}`. In files and overrides alike, `wheel_separation` (m, what data sheets of
-    differential drives print) may stand for `pursuer_half_axle`, which is half of it.
+    A file holds fields of `Scenario`; an optional `preset` names the one it starts from (`paper` otherwise).
+    A run's `config.json` works too: its `scenario` entry is used. If `obstacle_count` or `pursuer_count` is
+    less than the number of fixed starts, the first ones are kept. Flying robots have names, in files too:
+    `evader_model = "quadrotor"`, `pursuer_model = {model = "aircraft", turning_radius = 3.0}`. In files and
+    overrides, `wheel_separation` (m, as in data sheets of differential drives) may replace
+    `pursuer_half_axle`, which is half of it.
 
     **Raises** `ScenarioError` (a `ValueError`) naming the field, its value and what is allowed.
     """
@@ -226,7 +226,7 @@ def load_scenario(name_or_path: str | Path, **overrides: Any) -> Scenario:
 
 
 def _changed(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """`values` with `changes`; starts that are given anew bring their own number with them."""
+    """`values` with `changes`; new starts also set the number of robots."""
     kept, changes = dict(values), without_aliases(changes)
     for starts, count in _STARTS.items():
         if changes.get(starts) is not None:
@@ -235,10 +235,10 @@ def _changed(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str,
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
-    """All fields as plain JSON values; `load_scenario` rebuilds the same scenario from them.
+    """All fields as JSON values, from which `load_scenario` rebuilds the scenario.
 
-    Robots of one's own (`evader_model`, `pursuer_model`) are code, and stand there as text that says what
-    they were: `load_scenario` then asks for them. Those known by name it finds by itself.
+    Custom robots (`evader_model`, `pursuer_model`) are code. They are described by a text, and must be passed
+    to `load_scenario` again. Robots with a name are rebuilt.
     """
 
     def plain(value: Any) -> Any:
@@ -246,7 +246,7 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
             if isinstance(value, kind):
                 return {"model": name, **{one.name: plain(getattr(value, one.name)) for one in fields(value)}}
         if isinstance(value, (jax.Array, np.ndarray)):
-            # The shortest decimal that rounds to the stored float: 0.1574, not 0.15739999711513519.
+            # The shortest decimal with the same float value: 0.1574, not 0.15739999711513519.
             return np.asarray(value).astype(str).astype(float).tolist()
         return repr(value) if isinstance(value, tuple(_MODELS.values())) else value
 

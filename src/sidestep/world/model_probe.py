@@ -1,4 +1,4 @@
-"""Does a robot that a user brings keep its word? What is wrong with its model, in plain words."""
+"""Check models of custom robots: errors, and whether the control point moves as commanded."""
 
 from __future__ import annotations
 
@@ -24,14 +24,18 @@ _OFF = 0.01
 
 
 class ModelWarning(UserWarning):
-    """A robot's model works, but its control point does not move quite as it is told."""
+    """A robot's model works, but its control point does not move exactly as commanded."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaderProbe:
-    """What was seen of an evader that is told something new in every period: `tracking_error` (m/s), how far
-    the velocity of its control point is from the one told at most, which is for `Budget`; `offset` (m), how
-    far that point is from the robot at most; `errors` in words."""
+    """The result of driving an evader with a new command in every period.
+
+    - `tracking_error` m/s: largest difference between the control point's velocity and the command, for
+      `Budget`
+    - `offset` m: largest distance of the control point from the robot
+    - `errors` of the model, in words
+    """
 
     errors: tuple[str, ...]
     tracking_error: float
@@ -40,8 +44,8 @@ class EvaderProbe:
 
 @eqx.filter_jit
 def _drive(model: EvaderModel, scenario: Scenario, key: Any) -> tuple[Array, Array, EvaderState, EvaderState]:
-    """Of one robot told something new in every period: velocity errors of its control point, distances of
-    that from the robot, and the states reached in one step and in parts."""
+    """Drive one robot with a new command in every period. Returns the velocity errors of its control point
+    (m/s), the distances of that from the robot (m), and the states after one step and after its parts."""
     period = scenario.control_period
     part = period / _PARTS
     start_key, command_key = jax.random.split(key)
@@ -66,10 +70,10 @@ def _drive(model: EvaderModel, scenario: Scenario, key: Any) -> tuple[Array, Arr
 
 
 def probe_evader(model: EvaderModel, scenario: Scenario) -> EvaderProbe:
-    """Drive 256 robots for 40 periods each, told velocities at random at full speed.
+    """Drive 256 robots for 40 periods each, with random commands at full speed.
 
-    **Errors**: answers of wrong shape or not finite; a motion that differs between one step and four parts of
-    it; a control point farther from the robot than `offset`.
+    **Errors**: results of wrong shape or not finite; a motion that differs between one step and its four
+    parts; a control point farther from the robot than `offset`.
     """
     wrong = _evader_shapes(model, scenario)
     if wrong:
@@ -82,19 +86,19 @@ def probe_evader(model: EvaderModel, scenario: Scenario) -> EvaderProbe:
     if not all(np.all(np.isfinite(values)) for values in (errors, offsets, *leaves)):
         found.append("after(...) or control_point(...) is not finite for a finite robot")
         return EvaderProbe(tuple(found), 0.0, 0.0)
-    # Angles may have gone once round.
+    # Angles may differ by full turns.
     apart = np.abs(leaves[0] - leaves[1])
     apart = float(np.max(np.minimum(apart, np.abs(apart - 2.0 * np.pi))))
     if apart > _ROUNDING:
         found.append(
-            f"after(...) over one period and over four parts of it end {apart:.2g} apart: with time = 0 it "
-            "must leave the robot as it is, and hold the command meanwhile, whatever the time"
+            f"after(...) over one period and over four parts of it end {apart:.2g} apart: the command must "
+            "be held for any time, and time = 0 must not change the robot"
         )
     allowed, farthest = float(model.offset(scenario)), float(np.max(offsets))
     if farthest > allowed + _ROUNDING:
         found.append(
-            f"the control point was seen {farthest:.4g} m from the robot, offset(...) says {allowed:.4g} m: "
-            "shields would keep too little"
+            f"the control point was {farthest:.4g} m from the robot, but offset(...) is {allowed:.4g} m: "
+            "shields would keep too little distance"
         )
     return EvaderProbe(tuple(found), float(np.max(errors)), farthest)
 
@@ -151,7 +155,7 @@ def pursuer_errors(model: PursuerModel, scenario: Scenario) -> list[str]:
     if not np.all(np.isfinite(taken)):
         return ["limit(...) is not finite for finite numbers"]
     found = []
-    # A pair is outside a convex hull if in some direction it is farther than every corner.
+    # A pair is outside a convex hull if it is farther than every corner in some direction.
     angles = np.linspace(-np.pi, np.pi, 181)
     size = np.max(np.abs(np.concatenate([corners, taken])), axis=0) + 1e-9
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=0)
@@ -160,7 +164,7 @@ def pursuer_errors(model: PursuerModel, scenario: Scenario) -> list[str]:
         pair = taken[np.unravel_index(np.argmax(beyond), beyond.shape)[0]]
         found.append(
             f"limit(...) lets the pair ({pair[0]:.3g} m/s, {pair[1]:.3g} rad/s) through, which is outside "
-            "the hull of corners(...): barriers would not reckon with it"
+            "the hull of corners(...): barriers would not account for it"
         )
     if covering is not None:
         rim, axle = (float(part) for part in covering)
@@ -177,8 +181,8 @@ def pursuer_errors(model: PursuerModel, scenario: Scenario) -> list[str]:
 
 
 def check_models(scenario: Scenario) -> list[str]:
-    """What is wrong with the models of a scenario. **Warns** `ModelWarning`, with the tracking error for
-    `Budget`, if the control point does not move as it is told."""
+    """Errors of a scenario's models, in words. **Warns** `ModelWarning`, with the tracking error for
+    `Budget`, if the control point does not move as commanded."""
     found = []
     if scenario.pursuer_model is not None:
         name = type(scenario.pursuer_model).__name__
@@ -188,9 +192,10 @@ def check_models(scenario: Scenario) -> list[str]:
         found += [f"{name}: {error}" for error in seen.errors]
         if not seen.errors and seen.tracking_error > _OFF * float(scenario.evader_speed):
             warnings.warn(
-                f"{name}: its control point moves up to {seen.tracking_error:.3g} m/s otherwise than told. "
-                f"Shields allow for that with Budget(tracking_error={seen.tracking_error:.2g}), if the game "
-                "leaves room; or choose a point that follows",
+                f"{name}: its control point's velocity differs by up to {seen.tracking_error:.3g} m/s from "
+                "the command. Shields allow for that with "
+                f"Budget(tracking_error={seen.tracking_error:.2g}), if the game leaves room; or choose a "
+                "point that follows the command",
                 ModelWarning,
                 stacklevel=4,
             )

@@ -1,8 +1,8 @@
-"""What the evader perceives and how its policy speaks: the frame, the observation, the action.
+"""The policy's frame, observation and action.
 
 Observation, for m pursuers and k obstacles, in the axes of `scenario.frame`. With `"target"` the x axis
-points from the evader at the target, so a rotated world is the same problem; with `"world"` the axes are
-the world's. Entries are scaled to about [-1, 1]; p/(1 + |p|) squashes a vector p in metres.
+points from the evader to the target, so a rotated world gives the same observation; with `"world"` the axes
+are the world's. Entries are scaled to about [-1, 1]; "squashed" means p/(1 + |p|) for a vector p in m.
 
 | entries | meaning |
 |---|---|
@@ -11,8 +11,8 @@ the world's. Entries are scaled to about [-1, 1]; p/(1 + |p|) squashes a vector 
 | 5 per pursuer | position squashed (2), heading (cos, sin), exp(-c/0.2) for its clearance c (m) |
 | 5 per obstacle | position squashed (2), velocity / v_e (2), exp(-c/0.2) for its clearance c (m) |
 
-Pursuers and obstacles come nearest first, so their order in the world does not matter. A policy answers
-with an action in [-1, 1]^2 in the same axes; the velocity is v_e times the action, its norm cut to one.
+Pursuers and obstacles are sorted, nearest first, so their order in the world has no effect. The policy's
+action is in [-1, 1]^2 in the same axes; the velocity is v_e times the action, its norm clipped to 1.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ def observation_names(scenario: Scenario) -> list[str]:
 def frame_axes(
     scenario: Scenario, evader: Float[AnyArray, "2 *lanes"], target: Float[AnyArray, "2 *lanes"]
 ) -> Float[Array, "2 2 *lanes"]:
-    """Rows are the unit axes of the policy's frame in world coordinates; the world's own at the target."""
+    """The unit axes of the policy's frame in world coordinates, as rows; the world's axes at the target."""
     if scenario.frame == "world":
         one, none = jnp.ones_like(evader[0]), jnp.zeros_like(evader[0])
         return stack(stack(one, none), stack(none, one))
@@ -65,7 +65,7 @@ def frame_axes(
 def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lanes"]:
     """The observation of one world, or of each of many in lanes; see the table at the top of this module.
 
-    **Returns** `(observation_size(scenario),)`. `jax.vmap` it over worlds with their axis in front.
+    **Returns** `(observation_size(scenario),)`. Use `jax.vmap` for worlds with their axis first.
     """
     axes = frame_axes(scenario, world.evader, world.target)
     x, y = world.target[0] - world.evader[0], world.target[1] - world.evader[1]
@@ -81,19 +81,19 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
     def block(
         robots: Float[AnyArray, "n d *lanes"], extra: Callable[[Any], tuple[Lanes, Lanes]], contact: Scalar
     ) -> list[Lanes]:
-        """Entries of all robots of a kind, `extra` being the world vector that is told of each."""
+        """Entries of all robots of a kind; `extra` gives each robot's second vector, in world axes."""
         distances = [length(robot[0] - world.evader[0], robot[1] - world.evader[1]) for robot in robots]
         if len(distances) > 1:
             order = jnp.argsort(jnp.stack(distances), axis=0)
             robots = jnp.take_along_axis(robots, order[:, None], axis=0)
             distances = jnp.take_along_axis(jnp.stack(distances), order, axis=0)
-        told = []
+        entries = []
         for robot, distance in zip(robots, distances, strict=True):
             squash = 1.0 / (1.0 + distance)
-            told += along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash)
-            told += along(*extra(robot))
-            told.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / NEAR_ROBOT))
-        return told
+            entries += along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash)
+            entries += along(*extra(robot))
+            entries.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / NEAR_ROBOT))
+        return entries
 
     def heading(robot: Any) -> tuple[Lanes, Lanes]:
         return jnp.cos(robot[2]), jnp.sin(robot[2])
@@ -109,7 +109,7 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
 def to_velocity(
     scenario: Scenario, world: World, action: Float[AnyArray, "2 *lanes"]
 ) -> Float[Array, "2 *lanes"]:
-    """The nominal velocity (m/s, world axes) that a policy's action in [-1, 1]^2 asks for."""
+    """The nominal velocity (m/s, world axes) of a policy's action in [-1, 1]^2."""
     forward, aside = limit_speed(action, real(1.0))
     ahead, left = frame_axes(scenario, world.evader, world.target)
     speed = scenario.evader_speed
@@ -121,7 +121,7 @@ def to_velocity(
 def to_action(
     scenario: Scenario, world: World, velocity: Float[AnyArray, "2 *lanes"]
 ) -> Float[Array, "2 *lanes"]:
-    """The policy action that asks for `velocity` (m/s, world axes): the inverse of `to_velocity`."""
+    """The policy's action for `velocity` (m/s, world axes): the inverse of `to_velocity`."""
     ahead, left = frame_axes(scenario, world.evader, world.target)
     x, y = velocity[0] / scenario.evader_speed, velocity[1] / scenario.evader_speed
     return stack(ahead[0] * x + ahead[1] * y, left[0] * x + left[1] * y)

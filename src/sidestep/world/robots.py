@@ -1,4 +1,4 @@
-"""How robots move: exact motion over one zero-order hold, and the closest approach within it."""
+"""Exact motion of robots under constant commands, and their closest approach."""
 
 from itertools import pairwise
 from typing import Any
@@ -17,15 +17,15 @@ def limit_speed(
 ) -> Float[Array, "2 *lanes"]:
     """Project a velocity (m/s) on the disc |u| <= `speed_limit`; a non-finite velocity becomes a stop.
 
-    The physics never lets a command exceed what the robot can do, and never lets a NaN into the
-    state, where every later comparison with it would silently be false.
+    The physics thus never exceeds the robot's limits, and never gets a NaN into the state, where later
+    comparisons would silently be false.
     """
     finite = jnp.isfinite(velocity[0]) & jnp.isfinite(velocity[1])
-    # Clipped far above any speed, or else the square of a huge command overflows.
+    # Clipped far above any speed, so that the square of a huge command does not overflow.
     x, y = (jnp.clip(jnp.where(finite, component, 0.0), -1e15, 1e15) for component in velocity)
     squared = x * x + y * y
-    # At the limit rounding decides which side a speed is on, and XLA may compute it anew for each component:
-    # either answer must give the same, and so what is divided by must be the speed on both sides.
+    # At the limit, rounding decides the comparison, and XLA may evaluate it separately for each component.
+    # Both branches must therefore give the same result, and so both divide by the speed.
     fast = squared > 0.25 * speed_limit**2
     speed = jnp.sqrt(jnp.where(fast, squared, 1.0))
     scale = jnp.where(squared > speed_limit**2, speed_limit / speed, 1.0)
@@ -125,9 +125,9 @@ def closest_approach_driving(
 ) -> Lanes:
     """Smallest distance (m) between a robot in straight motion and a differential drive during a hold.
 
-    A straight line and an arc have no closed form. Four chords bracket the minimum, Newton's method on
-    d/dt |q|^2 refines it, and the distance is evaluated on the true paths, so the answer is never
-    below the true minimum and above it by second order in a time error that is itself tiny.
+    There is no closed form for a line and an arc. Four chords bracket the minimum, Newton's method on
+    d/dt |q|^2 refines it, and the distance is evaluated on the true paths. So the result is never below the
+    true minimum, and exceeds it only by second order in a tiny time error.
     """
     speed, turn_rate = body_velocity(wheel_speeds, half_axle)
     x, y = position[0] - pose[0], position[1] - pose[1]
@@ -135,9 +135,9 @@ def closest_approach_driving(
     ahead, left = jnp.cos(pose[2]), jnp.sin(pose[2])
 
     def arc(when: Any) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-        """Where the pursuer is on its arc, and cos and sin of its heading."""
-        # Half the turn away from the first heading points the chord, the other half the heading; adding
-        # angles by their cosines and sines, all need one pair of them.
+        """The pursuer's position on its arc, and cos and sin of its heading."""
+        # The chord points half the turn away from the first heading, the final heading the full turn. With
+        # addition theorems both need only one sine and one cosine.
         half_turn = turn_rate * when / 2.0
         cosine, sine = jnp.cos(half_turn), jnp.sin(half_turn)
         turning = half_turn != 0.0
@@ -149,7 +149,7 @@ def closest_approach_driving(
         px, py, _, _ = arc(when)
         return x + vx * when - px, y + vy * when - py
 
-    # Equal chords, each turned by the same angle against the one before it.
+    # Equal chords, each rotated by the same angle relative to the previous one.
     step = duration / _CHORDS
     px, py, cosine, sine = arc(step)
     cosine, sine = cosine * ahead + sine * left, sine * ahead - cosine * left

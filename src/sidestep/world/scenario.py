@@ -1,4 +1,4 @@
-"""A scenario: every constant of the problem, how an episode starts, and one step of its physics."""
+"""The scenario: all constants of the problem, the start of an episode, and one step of the physics."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ from sidestep.world.state import World
 
 _RESET_TRIES = 10_000
 _CHORDS = 8
-"""Straight pieces that the path of an evader of one's own is taken for, within one control period."""
+"""Number of chords that approximate the path of a custom evader within one control period."""
 
 
 class Scenario(eqx.Module):
     """All constants of one problem, with units. Build one with `sidestep.load_scenario`, which validates.
 
-    Real-valued fields are traced arrays, so one may `vmap` over speeds, gains or distances and another
-    value never recompiles; counts and modes are static. Starts left as `None` are drawn at random.
+    Real-valued fields are traced arrays: `vmap` over speeds, gains or distances is possible, and another
+    value never recompiles. Counts and modes are static. Starts that are `None` are drawn at random.
 
     **Speeds and sizes**
 
@@ -58,17 +58,17 @@ class Scenario(eqx.Module):
     **Shield** `pursuer_gain`, `obstacle_gain`, 1/s.
     **Reward** `reach_reward`; `distance_cost` per metre and control period.
 
-    **Random starts**, all uniform in a square of side `arena_side` (m) centred on the origin, subject to
-    evader and pursuer `initial_separation` apart, evader and obstacle `obstacle_separation` apart, evader
-    and target `target_separation` apart, target clear of obstacles, nobody captured at once. The square
-    only bounds the starts: the plane has no walls.
+    **Random starts**, uniform in a square of side `arena_side` (m) centred on the origin, with least
+    distances (m) of the evader: `initial_separation` from pursuers, `obstacle_separation` from obstacles,
+    `target_separation` from the target. The target is clear of obstacles, and the evader outside every
+    capture set. The square only bounds the starts: the plane has no walls.
 
     **Counts and modes** `pursuer_count`, `obstacle_count`, `episode_steps` (control periods),
     `action` = `"velocity"` (disc |u| <= v_e) or `"heading"` (circle |u| = v_e), `frame` = `"target"` or
     `"world"` (axes of observation and policy action).
 
-    **Robots of one's own** `evader_model`, `pursuer_model`, see `EvaderModel` and `PursuerModel`; None for
-    the omnidirectional evader and the differential drive. They are code: a file cannot hold them.
+    **Custom robots** `evader_model`, `pursuer_model`, see `EvaderModel` and `PursuerModel`; None for the
+    omnidirectional evader and the differential drive. They are code, and so not in files.
     """
 
     evader_speed: Scalar = eqx.field(converter=real, default=0.1574, metadata=within(above=0.0, unit="m/s"))
@@ -105,7 +105,7 @@ class Scenario(eqx.Module):
 
     @property
     def usable_angle(self) -> Scalar:
-        """S = arccos(v_e / V), rad; 0 when the evader is at least as fast."""
+        """S = arccos(v_e / V), rad; 0 if the evader is at least as fast as the pursuer."""
         return usable_angle(self.evader_speed, self.pursuer_speed)
 
     def _draw(self, key: PRNGKeyArray) -> World:
@@ -138,13 +138,12 @@ class Scenario(eqx.Module):
         )
 
     def accepts(self, world: World) -> Flag:
-        """Whether a world may start an episode: nobody captured at once, nothing inside an obstacle.
+        """Whether an episode may start in a world: no immediate capture, nothing inside an obstacle.
 
-        The separations of the random distribution bind only what is drawn, never a start that the user
-        fixed.
+        The separations of random starts hold for drawn positions only, not for fixed ones.
         """
         in_frame = jax.vmap(to_pursuer_frame, in_axes=(None, 0))(world.evader, world.pursuers)
-        # Which pursuers capture at once, and which only by turning first, is known of differential drives.
+        # The capture set is known for differential drives only.
         angle = self.usable_angle if self.pursuer_model is None else jnp.zeros_like(self.usable_angle)
         escape = jax.vmap(capture_set_distance, in_axes=(0, None, None))(
             in_frame, angle, self.capture_distance
@@ -168,10 +167,10 @@ class Scenario(eqx.Module):
         return good
 
     def reset(self, key: PRNGKeyArray) -> World:
-        """A world that starts an episode: drawn until `accepts` agrees.
+        """The start of an episode: a random world that `accepts` allows.
 
-        `load_scenario` has checked that such worlds exist; should one be out of reach all the same
-        (a scenario changed under `vmap`, say), the last draw is returned after 10,000 tries.
+        `load_scenario` has checked that such worlds exist. If none is found (for example in a scenario
+        changed under `vmap`), the last draw is returned after 10,000 tries.
         """
 
         def again(carry: tuple[PRNGKeyArray, World, Array]) -> Array:
@@ -190,15 +189,15 @@ class Scenario(eqx.Module):
         action: Float[AnyArray, "2 *lanes"],
         wheel_speeds: Float[AnyArray, "m 2 *lanes"] | Float[AnyArray, "2 *lanes"],
     ) -> tuple[World, Events]:
-        """One control period of pure physics: no shield, no policy; of one world, or of many in lanes.
+        """One control period of the physics, without shield and policy; for one world, or many in lanes.
 
-        **Arguments:** `action` the evader's velocity (m/s, world axes), projected on what the robot can
-        do (disc or circle); `wheel_speeds` left and right rim speed (m/s) of each pursuer, clipped to
-        [-V, V]. Non-finite commands count as a stop.
+        **Arguments:** `action` the evader's velocity (m/s, world axes), projected on the disc or circle of
+        possible ones; `wheel_speeds` left and right rim speed (m/s) of each pursuer, clipped to [-V, V].
+        Non-finite commands count as a stop.
 
-        **Returns** the world one period later and the `Events` of the period. The reward is
-        `reach_reward` when the target was reached, else -`distance_cost` times the distance to it at the
-        end of the period (paper, eq. for r).
+        **Returns** the world one period later and the `Events` of the period. The reward is `reach_reward` if
+        the target was reached, else -`distance_cost` times the distance (m) to it at the end of the period
+        (paper, equation for r).
         """
         period = self.control_period
         velocity = self.executable(action)
@@ -206,11 +205,11 @@ class Scenario(eqx.Module):
         wheels = jax.vmap(self.drivable)(jnp.reshape(wheel_speeds, shape))
         if self.evader_model is None:
             given = (self, world, velocity, wheels, period)
-            # Every event asks for them, and in lanes XLA would compute them anew for each.
+            # Every event uses them, and in lanes XLA would recompute them for each.
             least = no_fuse(Scenario._approaches, *given) if world.lanes else Scenario._approaches(*given)
             to_pursuers, to_obstacles, to_target = least
         else:
-            # One program for all pieces: written out they take long to compile.
+            # One program for all pieces: a loop in Python takes long to compile.
             to_pursuers, to_obstacles, to_target = jax.tree.map(
                 lambda least: jnp.min(least, axis=0),
                 jax.vmap(self._approaches, in_axes=(0, 0, None, None))(
@@ -221,7 +220,7 @@ class Scenario(eqx.Module):
         obstacle_clearance = fold(jnp.minimum, to_obstacles, jnp.inf) - self.collision_distance
 
         moved = self.moved(world, velocity, wheels)
-        # As counted there, in whole periods.
+        # In whole periods, as in `moved`.
         periods = jnp.round(moved.time / period)
         captured = pursuer_clearance <= 0.0
         collided = obstacle_clearance <= 0.0
@@ -262,10 +261,10 @@ class Scenario(eqx.Module):
     def _pieces(
         self, world: World, command: Array, wheels: Array
     ) -> tuple[World, Float[Array, "pieces 2 *lanes"]]:
-        """The period in pieces, one behind the other along a first axis: the worlds in which they begin, and
-        the velocities (m/s) with which the evader drives their chords instead of its path.
+        """The period in pieces, along a first axis: the worlds at their beginnings, and the evader's
+        velocities (m/s) along the chords of its path.
 
-        A path with acceleration a is off its chords by up to a (T/8)^2/8, 5 um for 1 m/s^2 at 20 Hz.
+        A path with acceleration a deviates from its chords by up to a (T/8)^2/8, 5 um for 1 m/s^2 at 20 Hz.
         """
         piece = self.control_period / _CHORDS
         times = piece * jnp.arange(_CHORDS + 1).astype(piece.dtype)
@@ -279,8 +278,8 @@ class Scenario(eqx.Module):
         velocity: Float[Array, "2 *lanes"],
         wheel_speeds: Float[Array, "m 2 *lanes"],
     ) -> World:
-        """Where everything is one control period later, for commands that the robots can execute."""
-        # Counting whole periods keeps float32 time exact enough to compare with the limit.
+        """The world one control period later, for commands within the robots' limits."""
+        # Counting whole periods keeps the float32 time exact enough for the time limit.
         periods = jnp.round(world.time / self.control_period) + 1.0
         there = self._moved(world, velocity, wheel_speeds, self.control_period)
         return eqx.tree_at(
@@ -288,7 +287,7 @@ class Scenario(eqx.Module):
         )
 
     def _moved(self, world: World, velocity: Array, wheel_speeds: Array, duration: Scalar) -> World:
-        """Where everything is after `duration` (s); neither time nor wheel speeds are brought up to date."""
+        """The world after `duration` (s); time and wheel speeds are not updated."""
         obstacles = world.obstacles
         pursuers = jax.vmap(drive, in_axes=(0, 0, None, None))(
             world.pursuers, wheel_speeds, self.pursuer_half_axle, duration
@@ -315,7 +314,8 @@ class Scenario(eqx.Module):
         return lane_by_lane(after, world.lanes, evader_of(world), command)
 
     def drivable(self, wheel_speeds: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
-        """The wheel speeds (m/s) a pursuer drives when told `wheel_speeds`; those not finite count as 0."""
+        """The wheel speeds (m/s) a pursuer drives for commanded `wheel_speeds`; non-finite ones count as
+        0."""
         if self.pursuer_model is None:
             return limit_wheels(wheel_speeds, self.pursuer_speed)
         wheels = stack(*(jnp.where(jnp.isfinite(speed), speed, 0.0) for speed in wheel_speeds))
@@ -328,32 +328,31 @@ class Scenario(eqx.Module):
 
     @property
     def built_in(self) -> bool:
-        """Whether the robots are the omnidirectional evader and the differential drive, which barriers,
-        certificate and falsifier speak of."""
+        """Whether the robots are the omnidirectional evader and the differential drive, for which barriers,
+        certificate and falsifier are made."""
         return self.evader_model is None and self.pursuer_model is None
 
     def check_built_in(self, what: str, instead: str) -> None:
-        """**Raises** `ValueError` where the robots are others: `what` is for the built-in ones only, and what
-        to do `instead`."""
+        """**Raises** `ValueError` for other robots: `what` supports the built-in robots only; the message
+        ends with the advice `instead`."""
         models = [
             type(model).__name__ for model in (self.evader_model, self.pursuer_model) if model is not None
         ]
         if models:
             raise ValueError(
-                f"{what} knows the omnidirectional evader and the differential drive only, and the scenario "
+                f"{what} supports only the omnidirectional evader and the differential drive, but scenario "
                 f"'{self.name}' has {' and '.join(models)}: {instead}"
             )
 
     def executable(self, velocity: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
-        """The velocity (m/s) the evader drives when told `velocity`: on the disc, or on the circle.
+        """The velocity (m/s) the evader drives for the commanded `velocity`: on the disc, or on the circle.
 
-        In `heading` mode a robot told to stop keeps its circle speed along world x, since the speed is
-        not its to choose.
+        In `heading` mode the speed is fixed, so a stop becomes the circle's speed along world x.
         """
         limited = limit_speed(velocity, self.evader_speed)
         if self.action == "velocity":
             return limited
-        # Scaled before it is squared, or else a tiny command underflows and loses its direction.
+        # Scaled before it is squared, so that a tiny command does not underflow and lose its direction.
         largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(limited[0]), jnp.abs(limited[1])))
         moving = largest > 0.0
         safe = jnp.where(moving, largest, 1.0)

@@ -1,4 +1,4 @@
-"""The state of the world: where everything is."""
+"""The state of the world."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from jaxtyping import Array, Bool, Float
 from sidestep._arrays import AnyArray, Scalar, real
 
 WORLD_FIELDS = ("evader", "pursuers", "obstacles", "target", "time", "evader_velocity", "wheel_speeds")
-"""What every world has, by name."""
+"""The fields of every world."""
 
 
 class World(eqx.Module):
-    """Everything that exists, as a pytree. SI units, headings counter-clockwise in rad.
+    """The state of all robots, as a pytree. SI units, headings counter-clockwise in rad.
 
-    `evader_velocity` and `wheel_speeds` are what was executed in the last control period (zero after
-    a reset): pursuers may lead the evader, and the evader may measure the pursuers' motion.
+    `evader_velocity` and `wheel_speeds` are those executed in the last control period (zero after a reset).
+    Pursuers use the first to intercept the evader, and shields may use the second.
 
     **Attributes:** `evader (2,)`; `pursuers (m, 3)` x, y, heading; `obstacles (k, 4)` x, y, vx, vy;
     `target (2,)`; `time ()` in s; `evader_velocity (2,)`; `wheel_speeds (m, 2)` left, right;
-    `evader_state (s,)` what a model of one's own keeps of the evader (`EvaderModel`), None without one.
+    `evader_state (s,)` of a custom `EvaderModel`, None without one.
     """
 
     evader: Float[Array, "2"]
@@ -63,16 +63,16 @@ class World(eqx.Module):
 
     @property
     def lanes(self) -> int:
-        """How many batch axes the world has behind its components; none unless it holds many worlds."""
+        """The number of batch axes after the components; 0 for a single world."""
         return self.evader.ndim - 1
 
     @property
     def pursuer(self) -> Float[AnyArray, "3 *lanes"]:
-        """The pursuer being steered or asked about: x, y, heading."""
+        """The pursuer that a strategy steers, the first one: x, y, heading."""
         return self.pursuers[0]
 
     def seen_by(self, index: int) -> World:
-        """The same world with pursuer `index` first, which is how a strategy is asked for it."""
+        """The same world with pursuer `index` first, as a strategy for it gets it."""
         if index == 0:
             return self
         return eqx.tree_at(
@@ -82,10 +82,10 @@ class World(eqx.Module):
         )
 
     def set_apart(self, when: Bool[Array, "*lanes"]) -> World:
-        """The same world, but with pursuers and obstacles a kilometre further off where `when`.
+        """The same world with pursuers and obstacles moved by 1 km where `when`.
 
-        For an episode that has ended and is only stepped on because others of its batch have not: out there
-        no shield has anything to think about.
+        For ended episodes that are stepped along with the rest of their batch: a shield with look-ahead then
+        decides quickly.
         """
         off = jnp.where(when, 1000.0, 0.0)
         return eqx.tree_at(
@@ -96,9 +96,9 @@ class World(eqx.Module):
 
 
 def worlds_of(parts: Mapping[str, AnyArray]) -> World:
-    """Many worlds in one, from arrays with the same leading axes, by the names of `WORLD_FIELDS`, and
-    `evader_state` where there is one. `World` itself is made for a single one."""
-    place, own = jnp.zeros(2), "evader_state" in parts
-    one = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place, evader_state=place if own else None)
-    names = (*WORLD_FIELDS, "evader_state") if own else WORLD_FIELDS
+    """A `World` of many worlds, from arrays with equal leading axes, named as in `WORLD_FIELDS` and
+    optionally `evader_state`. The constructor of `World` is for a single world."""
+    place, has_state = jnp.zeros(2), "evader_state" in parts
+    one = World(place, jnp.zeros((1, 3)), jnp.zeros((1, 4)), place, evader_state=place if has_state else None)
+    names = (*WORLD_FIELDS, "evader_state") if has_state else WORLD_FIELDS
     return jax.tree.unflatten(jax.tree.structure(one), [jnp.asarray(parts[name]) for name in names])
