@@ -1,4 +1,4 @@
-"""Who chases, and how well can it: the capture game and the pursuer strategies."""
+"""The capture game and the pursuer strategies."""
 
 from sidestep.pursuit.catalogue import CHAUFFEURS, PURSUERS, make_pursuer
 from sidestep.pursuit.foreign import as_pursuer

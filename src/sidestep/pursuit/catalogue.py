@@ -1,4 +1,4 @@
-"""Every strategy by the name the command line knows it by."""
+"""The built-in strategies by name."""
 
 from sidestep.pursuit.chauffeur import Chauffeur
 from sidestep.pursuit.pursuers import (
@@ -21,13 +21,13 @@ PURSUERS: dict[str, type[Pursuer]] = {
     "random": Random,
     "still": Still,
 }
-"""Strategies of a differential drive."""
+"""Strategies for a differential drive."""
 CHAUFFEURS: dict[str, type[Pursuer]] = {"chauffeur": Chauffeur}
-"""Strategies for what cannot turn on the spot, whatever it is; a differential drive can play them, too."""
+"""Strategies for robots that cannot turn on the spot; a differential drive can use them, too."""
 
 
 def make_pursuer(name: str) -> Pursuer:
-    """The strategy called `name`, of `PURSUERS` or `CHAUFFEURS`; a ValueError lists the names there are."""
+    """The strategy `name` of `PURSUERS` or `CHAUFFEURS`. **Raises** `ValueError` for an unknown name."""
     known = PURSUERS | CHAUFFEURS
     if name not in known:
         raise ValueError(f"unknown pursuer {name!r}; known pursuers: {', '.join(known)}")

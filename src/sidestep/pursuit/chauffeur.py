@@ -21,28 +21,29 @@ _HALVINGS = 6
 
 
 def _turn_to(x: Lanes, y: Lanes, radius: Lanes) -> tuple[Lanes, Lanes, Bool[Array, "*lanes"]]:
-    """Turn (rad, not negative) towards a place at the side of `y`, way (m) along arc and tangent to it, and
-    whether it lies inside the turning circle; then the way is that around the circle on the other side."""
+    """Turn (rad, >= 0) towards the side of `y`, length (m) of the arc and its tangent to the point (x, y),
+    and whether the point lies inside the turning circle; then the length is that with a turn to the other
+    side."""
     aside = jnp.abs(y)
     inside = x * x + (aside - radius) ** 2 < radius * radius
-    # From a circle's centre: the place, less the angle between it and the point where the tangent is.
+    # Angles at the circle's centre: to the point, less that between the point and the tangent point.
     beside = jnp.where(inside, -aside, aside)
     squared = x * x + (beside - radius) ** 2 - radius * radius
     straight = jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))
     turn = jnp.mod(jnp.arctan2(x, radius - beside) - jnp.arctan2(straight, radius), 2.0 * jnp.pi)
-    # Straight ahead rounding makes a full circle of no turn at all.
+    # Straight ahead, rounding may turn 0 into a full circle.
     turn = jnp.where(2.0 * jnp.pi - turn < 1e-3, 0.0, turn)
     return turn, radius * turn + straight, inside
 
 
 @final
 class Chauffeur(Pursuer):
-    """To where it meets the evader soonest if that keeps its velocity, as fast as it can without being early.
+    """Drives to the earliest interception point with an evader of constant velocity, without arriving early.
 
-    The way there is an arc of the smallest radius and its tangent (Dubins, "On curves of minimal length",
-    American Journal of Mathematics 1957). While that place lies inside the turning circle it flies straight
-    on, to turn back from farther away: the swerve of the homicidal chauffeur (Isaacs, "Differential Games",
-    1965). The radius is that of whatever the scenario's pursuer does when told to turn as fast as it can.
+    The path is an arc of the smallest radius and its tangent (Dubins, "On curves of minimal length", American
+    Journal of Mathematics 1957). While the point lies inside the turning circle it drives straight, to turn
+    back from farther away: the swerve of the homicidal chauffeur (Isaacs, "Differential Games", 1965). The
+    radius is that of the scenario's pursuer at its largest turn rate.
     """
 
     takes_lanes = True
@@ -61,8 +62,8 @@ class Chauffeur(Pursuer):
             _, way, _ = _turn_to(z[0] + ahead[0] * time, z[1] + ahead[1] * time, radius)
             return way - scenario.capture_distance > speed * time
 
-        # The first of many times at which it could be there, and then more closely. Places inside the circle
-        # part those times into stretches, so that neither halving all time nor a fixed point finds the first.
+        # Search the first time at which it can arrive on a grid, then refine by bisection. Points inside the
+        # circle split the feasible times into intervals, so bisection alone or a fixed point may miss it.
         def later(_: Any, found: tuple[Lanes, Lanes]) -> tuple[Lanes, Lanes]:
             time, step = found
             waits = comes_too_late(time)
@@ -81,10 +82,10 @@ class Chauffeur(Pursuer):
         turn, way, inside = _turn_to(x, y, radius)
         side = jnp.where(y < 0.0, -1.0, 1.0)
         turn = jnp.where(inside, 0.0, side * turn)
-        # Right in front of it, it turns at the evader itself.
+        # Close to the evader, turn directly towards it.
         near = distance <= 2.0 * scenario.capture_distance
         turn = jnp.where(near, bearing_of(stack(z[0], z[1])), turn)
-        # There before the evader it could not wait.
-        hurry = jnp.clip(way / (speed * jnp.maximum(time, period)), 0.0, 1.0)
-        told = full * jnp.where(near | inside, 1.0, hurry)
-        return wheels_from_body(told, jnp.clip(turn / period, -turn_rate, turn_rate), axle)
+        # It cannot wait for the evader, so it slows down to arrive in time.
+        share = jnp.clip(way / (speed * jnp.maximum(time, period)), 0.0, 1.0)
+        forward = full * jnp.where(near | inside, 1.0, share)
+        return wheels_from_body(forward, jnp.clip(turn / period, -turn_rate, turn_rate), axle)

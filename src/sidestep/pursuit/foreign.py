@@ -1,4 +1,4 @@
-"""Anyone's own pursuer: a plain callable, written with JAX or not."""
+"""Custom pursuers: plain callables, written with JAX or not."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from sidestep.world.state import World
 
 
 class _NotTraceable(TypeError):
-    """The callable's answer holds nothing that JAX made."""
+    """The callable's answer contains no JAX array."""
 
 
 @final
 class CallablePursuer(Pursuer):
     """A callable `(scenario, world, key) -> wheel_speeds (2,)` as a pursuer.
 
-    One written with JAX is traced like our own. One that needs concrete numbers (NumPy, Python's `if` or
-    `math`) runs on the host through `jax.pure_callback`, under `jit` and `vmap` too: slower, and
-    one world at a time. There it gets `scenario` and `world` with NumPy arrays for fields and the key's
-    raw words, which seed NumPy as in `numpy.random.default_rng(key)`; it must not keep state of its own.
+    A callable written with JAX is traced. One that needs concrete numbers (NumPy, Python's `if` or `math`)
+    runs on the host through `jax.pure_callback`, under `jit` and `vmap` too: slower, and one world at a time.
+    There `scenario` and `world` have NumPy arrays as fields, and `key` is the key's raw words, which seed
+    NumPy as in `numpy.random.default_rng(key)`. The callable must not keep state.
 
-    Arrays inside the callable (a learned pursuer's weights, say) stay traced data; the rest is static.
+    Arrays inside the callable, such as a learned pursuer's weights, are traced data; the rest is static.
     """
 
     _arrays: Any
@@ -48,7 +48,7 @@ class CallablePursuer(Pursuer):
 
 
 def runs_on_host(pursuer: Pursuer, scenario: Scenario) -> bool:
-    """Whether this is a callable that needs concrete numbers, and so is asked on the host."""
+    """Whether this is a callable that needs concrete numbers and so runs on the host."""
     if not isinstance(pursuer, CallablePursuer):
         return False
     strategy, traceable = eqx.combine(pursuer._arrays, pursuer._rest), False
@@ -57,17 +57,17 @@ def runs_on_host(pursuer: Pursuer, scenario: Scenario) -> bool:
         nonlocal traceable
         traceable = _is_traceable(strategy, scenario, scenario.reset(key), key)
 
-    # Only what shapes it would have.
+    # Shapes only: nothing is computed.
     jax.eval_shape(start, jax.random.key(0))
     return not traceable
 
 
 def _is_traceable(strategy: Callable[..., Any], scenario: Scenario, world: World, key: PRNGKeyArray) -> bool:
-    """Whether JAX can trace the callable; tried even outside `jit`, so that it behaves the same there.
+    """Whether JAX can trace the callable; checked outside `jit` too, so that it behaves the same there.
 
-    Code that answers in NumPy while being traced is not: a draw from NumPy's random state, say, would be
-    frozen into the compiled program. NumPy refuses tracers with a TypeError; one that has another cause
-    comes up again on the host.
+    A callable that returns NumPy values while being traced counts as not traceable: a draw from NumPy's
+    random state, for example, would become a constant of the compiled program. NumPy rejects tracers with a
+    TypeError; a TypeError of another cause is raised again on the host.
     """
 
     def attempt(*arguments: Any) -> Any:
@@ -109,7 +109,7 @@ def _on_host(strategy: Callable[..., Any], scenario: Scenario, world: World, key
 def as_pursuer(pursuer: str | Pursuer | Callable[..., Any]) -> Pursuer:
     """A pursuer from a name, a `Pursuer` or any callable `(scenario, world, key) -> wheel_speeds (2,)`.
 
-    Raises a ValueError for an unknown name and a TypeError for anything else.
+    **Raises** `ValueError` for an unknown name and `TypeError` for any other object.
     """
     if isinstance(pursuer, str):
         return make_pursuer(pursuer)

@@ -1,13 +1,13 @@
-"""The capture game: who wins, how far the evader is from being caught, and how well each side can play.
+"""The capture game: who wins, the evader's distance from capture, and optimal play of both sides.
 
 Isaacs' equations for an omnidirectional evader and a differential-drive pursuer (Ruiz, Murrieta-Cid,
 Marroquin, "Time-Optimal Motion Strategies for Capturing an Omnidirectional Evader Using a
 Differential Drive Robot", IEEE T-RO 2013), in the pursuer's frame: z = (ahead, left) of the evader.
-For a unit vector n, the direction in which the evader gains,
+For a unit vector n,
 
     n.z' = n.u - v n_x + omega sigma,    sigma = n_x z_y - n_y z_x,
 
-so that the best the pursuer can do, with |v| + b |omega| <= V, is n.z' = n.u - V max(|n_x|, |sigma|/b).
+so the pursuer, with |v| + b |omega| <= V, can lower n.z at most to n.z' = n.u - V max(|n_x|, |sigma|/b).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sidestep.world.scenario import Scenario
 
 
 def _sign(value: Float[AnyArray, "*lanes"]) -> Lanes:
-    """+1 or -1, and +1 at 0: a side must be chosen there too."""
+    """+1 or -1; +1 at 0."""
     return jnp.where(jnp.asarray(value) < 0.0, -1.0, 1.0).astype(jnp.asarray(value).dtype)
 
 
@@ -38,9 +38,9 @@ class CaptureGame(eqx.Module):
 
     **Arguments:** `evader_speed` v_e and `pursuer_speed` V (wheel rim), m/s; `half_axle` b and
     `capture_distance` l, m. All are traced, so another value never recompiles. b may be 0 (a pursuer that
-    turns at no cost) and the evader may be the faster one.
+    turns instantly) and the evader may be faster than the pursuer.
 
-    Methods take one point z (m) in the pursuer's frame; `jax.vmap` them over many.
+    Methods take one point z (m) in the pursuer's frame; use `jax.vmap` for many.
     """
 
     evader_speed: Scalar = eqx.field(converter=real)
@@ -60,7 +60,7 @@ class CaptureGame(eqx.Module):
 
     @property
     def usable_angle(self) -> Scalar:
-        """S = arccos(v_e/V), rad: contact can be forced only closer than this to the pursuer's axis."""
+        """S = arccos(v_e/V), rad: contact can be forced only at smaller angles to the pursuer's axis."""
         return usable_angle(self.evader_speed, self.pursuer_speed)
 
     @property
@@ -88,12 +88,12 @@ class CaptureGame(eqx.Module):
 
         h = r cos((S - beta')+) - l, with beta' the angle between z and the pursuer's axis, front or rear.
         Beyond the usable angle h is the range and n points away from the pursuer. In front and behind, h is
-        the distance to a line tangent to the disc of radius l, and there are two: `side` (+1 left, -1
-        right) picks the one to follow, h = |x| cos S + side y sin S - l. By default it is the evader's own
-        side, +1 on the axis, and then h is the distance from K(l) itself.
+        the distance to one of two lines tangent to the disc of radius l, h = |x| cos S + side y sin S - l.
+        `side` is +1 (left) or -1 (right). By default it is the side of the evader, +1 on the axis, and then h
+        is the distance from K(l).
 
-        For 0 <= h <= l_max - l this is the value of the game: the evader that follows n never lets the
-        pursuer closer than l + h (T-RO 2013; the value of the smallest distance).
+        For 0 <= h <= l_max - l this is the value of the game: an evader that follows n keeps the distance l +
+        h (T-RO 2013; the value of the smallest distance).
         """
         z = real(z)
         usable = self.usable_angle
@@ -103,7 +103,7 @@ class CaptureGame(eqx.Module):
         in_front = jnp.abs(z[1]) * cosine < jnp.abs(z[0]) * sine
         squared = z[0] * z[0] + z[1] * z[1]
         apart = squared > 0.0
-        # At the pursuer's very centre the tangent's direction, a limit from in front, is as good as any.
+        # At the pursuer's centre n is the tangent's normal, the limit from in front.
         distance = jnp.sqrt(jnp.where(apart, squared, 1.0))
         tangent = _sign(z[0]) * cosine, chosen * sine
         on_tangent = in_front | ~apart
@@ -114,16 +114,16 @@ class CaptureGame(eqx.Module):
         return jnp.where(other_tangent, along - self.capture_distance, value), stack(*normal)
 
     def _turning_gain(self, z: Float[AnyArray, "2 *lanes"], normal: Float[AnyArray, "2 *lanes"]) -> Lanes:
-        """|sigma|/b; infinite for a pursuer that turns at no cost, unless turning gains nothing."""
+        """|sigma|/b; for b = 0 infinite, or 0 where sigma = 0."""
         moment = jnp.abs(turning_moment(z, normal))
         axle = self.half_axle
         free = jnp.where(moment > 0.0, jnp.inf, 0.0)
         return jnp.where(axle > 0.0, moment / jnp.where(axle > 0.0, axle, 1.0), free)
 
     def pursuit_rate(self, z: Float[AnyArray, "2 *lanes"], normal: Float[AnyArray, "2 *lanes"]) -> Lanes:
-        """V max(|n_x|, |sigma|/b), m/s: the fastest the pursuer can lower n.z on its own.
+        """V max(|n_x|, |sigma|/b), m/s: the largest rate at which the pursuer can lower n.z.
 
-        The evader that moves with n.u >= pursuit_rate loses no ground against any admissible wheel speeds.
+        For an evader with n.u >= pursuit_rate, n.z does not decrease under any admissible wheel speeds.
         """
         z, normal = real(z), real(normal)
         return self.pursuer_speed * jnp.maximum(jnp.abs(normal[0]), self._turning_gain(z, normal))
@@ -136,7 +136,7 @@ class CaptureGame(eqx.Module):
         z, normal = real(z), real(normal)
         straight = jnp.abs(normal[0]) >= self._turning_gain(z, normal)
         forward = jnp.full(2, _sign(normal[0]))
-        # omega = -(V/b) sign(sigma): the right wheel runs forward to turn left.
+        # omega = -(V/b) sign(sigma); the right wheel drives forward to turn left.
         turn = _sign(turning_moment(z, normal)) * jnp.array([1.0, -1.0], z.dtype)
         return self.pursuer_speed * jnp.where(straight, forward, turn)
 
@@ -154,15 +154,15 @@ class CaptureGame(eqx.Module):
     def time_to_capture(self, z: Float[AnyArray, "2"]) -> Scalar:
         """Time to capture (s) under optimal play: 0 within l, infinite where capture cannot be forced.
 
-        It jumps across the capture set's sides. Differentiable in z, where Isaacs' equation gives the
-        gradient; the game's constants are held, and so are second derivatives.
+        It is discontinuous at the sides of the capture set. It is differentiable in z once, by Isaacs'
+        equation, and not in the game's constants.
         """
         return _time_to_capture(real(z), jax.lax.stop_gradient(self))
 
     def evader_saddle(self, z: Float[AnyArray, "2"]) -> Float[Array, "2"]:
-        """Direction (unit vector, pursuer's frame) in which the evader flees at z when both play well.
+        """The evader's direction (unit vector, pursuer's frame) at z under optimal play.
 
-        In the game of time where capture can be forced, else along the barrier's normal.
+        That of the game of time where capture can be forced, else the barrier's normal.
         """
         play = self.play(z)
         return jnp.where(jnp.isfinite(play.time), play.direction, self.barrier(z)[1])
@@ -170,7 +170,7 @@ class CaptureGame(eqx.Module):
     def pursuer_saddle(self, z: Float[AnyArray, "2"]) -> Float[Array, "2"]:
         """Wheel speeds (left, right; m/s) of the pursuer's saddle-point law at z.
 
-        In the game of time where capture can be forced, else against the barrier's normal.
+        That of the game of time where capture can be forced, else against the barrier's normal.
         """
         z = real(z)
         return self.steer_against(z, self.evader_saddle(z))
@@ -185,7 +185,7 @@ def _time_to_capture(z: Float[Array, "2"], game: CaptureGame) -> Scalar:
 def _time_to_capture_jvp(
     primals: tuple[Float[Array, "2"], CaptureGame], tangents: tuple[Float[Array, "2"], CaptureGame]
 ) -> tuple[Scalar, Scalar]:
-    """grad T = n / (V max(|n_x|, |sigma|/b) - v_e), since the time runs down at rate 1."""
+    """grad T = n / (V max(|n_x|, |sigma|/b) - v_e), since T decreases at rate 1 under optimal play."""
     (z, game), (z_dot, _) = primals, tangents
     play = game.play(z)
     closing = game.pursuit_rate(z, play.direction) - game.evader_speed

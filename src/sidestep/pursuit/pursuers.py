@@ -1,4 +1,4 @@
-"""Pursuer strategies behind one interface: given the world, the wheel speeds for one control period."""
+"""Pursuer strategies: from the world to the wheel speeds for one control period."""
 
 from __future__ import annotations
 
@@ -23,22 +23,23 @@ _INTERCEPT_STEPS = 8
 
 
 class Pursuer(eqx.Module):
-    """A strategy for one differential-drive pursuer. It steers `world.pursuer` and may look at all else.
+    """A strategy for one differential-drive pursuer. It steers `world.pursuer` and may use the whole world.
 
-    Subclasses define `steer`. Calling the strategy clips its answer to the wheel limits, so that no
-    strategy can cheat, by rounding or otherwise; wheel speeds that are not finite become a stop.
+    Subclasses define `steer`. Calling the strategy clips its answer to the wheel limits, so no strategy can
+    exceed them; non-finite wheel speeds become a stop.
 
-    One that computes with components and draws nothing, as most built-in ones, may set `takes_lanes`: it is
-    then asked for many worlds at once, with their axis behind all others; any other for each of them.
+    A strategy that computes with components and draws no random numbers, like most built-in ones, may set
+    `takes_lanes`: it is then called once with many worlds in lanes (their axis last). Others are called for
+    each world.
     """
 
     takes_lanes: ClassVar[bool] = False
     always_finite: ClassVar[bool] = False
-    """Whether its answer is finite in every world that is; others are watched, see `pursue`."""
+    """Whether its answer is finite in every finite world; answers of others are checked, see `pursue`."""
 
     @abc.abstractmethod
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
-        """Wanted wheel rim speeds (left, right; m/s) of `world.pursuer` for the next control period."""
+        """Unclipped wheel rim speeds (left, right; m/s) of `world.pursuer` for the next control period."""
 
     def __call__(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         """Wheel rim speeds (left, right; m/s) of `world.pursuer`, each within [-V, V]."""
@@ -60,13 +61,13 @@ def _toward(
 
 @final
 class Nash(Pursuer):
-    """The saddle point of the capture game: no pursuer does better against an evader that plays well.
+    """The saddle point of the capture game: optimal against an optimal evader.
 
-    Where capture is possible it plays the game of time. Where it is not, "Nash" in capture time means
-    nothing (every choice takes forever), so it plays for the smallest distance: from farther out it turns
-    its nearer end to the evader and drives, which brings it to the stand-off at b cot S; there, within
-    h_max of the capture set, it drives straight, which forces the distance down to l_max and no lower.
-    Beside the usable part, where driving on would only pass the evader by, it turns again.
+    Where capture can be forced, it minimises the time to capture. Elsewhere that time is infinite, so it
+    minimises the smallest distance. From afar it turns its nearer end to the evader and drives, to the
+    stand-off at b cot S. There, within h_max of the capture set, it drives straight, which forces the
+    distance down to l_max and no lower. Outside the usable angle, where it would pass the evader, it turns
+    again.
     """
 
     takes_lanes = True
@@ -75,7 +76,7 @@ class Nash(Pursuer):
     def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
         game = CaptureGame.of(scenario)
         z = to_pursuer_frame(world.evader, world.pursuer)
-        # The condition is the scenario's, not the world's, so a batch of worlds takes one branch only.
+        # The condition depends on the scenario only, so a batch of worlds takes one branch.
         return jax.lax.cond(
             game.evader_can_escape,
             lambda: _approach(scenario, game, z),
@@ -84,10 +85,10 @@ class Nash(Pursuer):
 
 
 def _hasten(game: CaptureGame, z: Float[Array, "2"], period: Scalar) -> Float[Array, "2"]:
-    """The time-optimal law, sampled: each phase of the play gets its share of the control period.
+    """The time-optimal law, sampled: each phase of optimal play gets its share of the control period.
 
-    It never turns past the evader. The play would, by as much as the evader runs on meanwhile, but near the
-    axis an evader that reverses every period could then keep a pursuer busy turning to and fro for ever.
+    It never turns past the evader. Optimal play does, to anticipate the evader's motion, but near the axis an
+    evader that reverses every period could then make the pursuer turn back and forth forever.
     """
     play = game.play(z)
     to_face = game.half_axle / game.pursuer_speed * jnp.arctan2(jnp.abs(z[1]), jnp.abs(z[0]))
@@ -101,12 +102,12 @@ def _hasten(game: CaptureGame, z: Float[Array, "2"], period: Scalar) -> Float[Ar
 
 
 def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
-    """The law for the smallest distance: face or back onto the evader, come close, and strike.
+    """The law for the smallest distance: turn an end to the evader, come close, then drive straight.
 
-    It strikes inside the capture set too, where driving straight on is also what captures soonest.
+    It drives straight inside the capture set too, where that captures soonest.
     """
     end, turn = nearer_end(bearing_of(z))
-    # The stand-off is only reached in infinite time; one period's driving away is near enough to strike.
+    # The stand-off is reached only asymptotically, so it drives straight from one period's distance on.
     reach = scenario.pursuer_speed * scenario.control_period
     strikes_from = game.largest_capture_distance - game.capture_distance + reach
     strike = (game.barrier(z)[0] <= strikes_from) & (jnp.abs(turn) <= game.usable_angle)
@@ -116,7 +117,7 @@ def _approach(scenario: Scenario, game: CaptureGame, z: Float[Array, "2 *lanes"]
 
 @final
 class TurnThenDrive(Pursuer):
-    """Turns in place until it faces the evader, then drives straight at it, correcting as it goes."""
+    """Turns in place until it faces the evader, then drives at it and corrects its heading."""
 
     takes_lanes = True
     always_finite = True
@@ -127,7 +128,7 @@ class TurnThenDrive(Pursuer):
 
 @final
 class TurnWhileDriving(Pursuer):
-    """Never stops driving forward: turns toward the evader on arcs no tighter than about its inner wheel."""
+    """Always drives forward: turns towards the evader on arcs whose centre is at most the inner wheel."""
 
     takes_lanes = True
     always_finite = True
@@ -139,10 +140,10 @@ class TurnWhileDriving(Pursuer):
 
 @final
 class PurePursuit(Pursuer):
-    """Drives, at full speed, the arc through the evader that starts along its own axis; reverses too.
+    """Drives at full speed, forward or backward, on the arc through the evader that is tangent to its axis.
 
-    The arc's curvature is 2 z_y/|z|^2, forward and backward alike (Coulter, "Implementation of the Pure
-    Pursuit Path Tracking Algorithm", CMU-RI-TR-92-01, 1992).
+    The arc's curvature is 2 z_y/|z|^2 (Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm",
+    CMU-RI-TR-92-01, 1992).
     """
 
     takes_lanes = True
@@ -161,10 +162,10 @@ class PurePursuit(Pursuer):
 
 @final
 class Interceptor(Pursuer):
-    """Drives at the point where it would meet the evader, were the evader to keep its velocity.
+    """Drives to the interception point with an evader of constant velocity.
 
-    The time to that point counts the turn in place, with the nearer end, and the straight drive after
-    it; a few fixed-point steps find it. Against an evader too fast to be met it aims far ahead.
+    The time to that point consists of a turn in place, with the nearer end, and a straight drive; it is found
+    by fixed-point steps. If the evader is too fast to be intercepted, it aims far ahead.
     """
 
     takes_lanes = True
@@ -208,28 +209,27 @@ class Still(Pursuer):
         return jnp.zeros_like(world.pursuer[:2])
 
 
-def _watched(scenario: Scenario, wheels: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
-    """What the pursuer drives, but what it asked for where that is not finite."""
+def _drivable(scenario: Scenario, wheels: Float[AnyArray, "2 *lanes"]) -> Float[Array, "2 *lanes"]:
+    """The wheel speeds (m/s) that the pursuer drives; non-finite ones are passed on."""
     finite = jnp.isfinite(wheels[0]) & jnp.isfinite(wheels[1])
     return jnp.where(finite, scenario.drivable(wheels), wheels)
 
 
 def without_answer(wheel_speeds: Float[AnyArray, "m 2 *lanes"]) -> Bool[Array, "*lanes"]:
-    """Whether any pursuer answered with wheel speeds that are not finite: it stands still instead, and an
-    evader that it does not catch is not safe for that."""
+    """Whether any pursuer's wheel speeds are not finite. It then stands still, so an evader that stays free
+    proves nothing."""
     return ~fold(jnp.logical_and, jnp.isfinite(wheel_speeds[:, 0]) & jnp.isfinite(wheel_speeds[:, 1]), True)
 
 
 def pursue(
     scenario: Scenario, pursuer: Callable[..., Any], world: World, key: Any
 ) -> Float[Array, "m 2 *lanes"]:
-    """Wheel rim speeds (left, right) in m/s of every pursuer, each asked with itself first and its own key.
+    """Wheel rim speeds (left, right) in m/s of every pursuer.
 
-    Each pair is within what the pursuer can drive, or not finite as the strategy answered, which physics take
-    for a stop: see `without_answer`.
-
-    A strategy with a method `steer_all(scenario, world) -> (m, 2)` is asked for all of them at once instead.
-    Worlds in lanes need a key each, unless the strategy takes lanes: those draw nothing.
+    The strategy is called for each pursuer, which comes first in its world, with a separate key. A strategy
+    with a method `steer_all(scenario, world) -> (m, 2)` is called once for all pursuers. Each pair is within
+    the pursuer's limits, or non-finite as the strategy returned it, which the physics takes for a stop: see
+    `without_answer`. Worlds in lanes need one key each, unless the strategy takes lanes.
 
     **Raises** `ValueError` when the strategy's answer does not have shape (2,).
     """
@@ -237,7 +237,7 @@ def pursue(
 
     def steer(world: World, key: Any) -> Float[Array, "m 2 *lanes"]:
         if together is not None:
-            return jax.vmap(lambda wheels: _watched(scenario, wheels))(together(scenario, world))
+            return jax.vmap(lambda wheels: _drivable(scenario, wheels))(together(scenario, world))
         count = scenario.pursuer_count
         keys = [key] * count if world.lanes else jax.random.split(key, count)
         answers = []
@@ -249,7 +249,7 @@ def pursue(
                 raise ValueError(
                     f"a pursuer must answer with wheel speeds (left, right) of shape (2,), not {wheels.shape}"
                 )
-            answers.append(_watched(scenario, real(wheels)) if watched else real(wheels))
+            answers.append(_drivable(scenario, real(wheels)) if watched else real(wheels))
         return jnp.stack(answers)
 
     if getattr(pursuer, "takes_lanes", False):

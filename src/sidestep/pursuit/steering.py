@@ -1,4 +1,4 @@
-"""Wheel speeds that bring a differential drive onto a bearing and along it, held for one control period."""
+"""Wheel speeds that turn a differential drive to a bearing and drive along it, for one control period."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,12 +11,12 @@ def bearing_of(z: Float[AnyArray, "2 *lanes"]) -> Lanes:
     """Direction (rad) of z, in [-pi, pi]; 0 at the origin, with a finite derivative there."""
     somewhere = (z[0] != 0.0) | (z[1] != 0.0)
     ahead, left = jnp.where(somewhere, z[0], 1.0), jnp.where(somewhere, z[1], 0.0)
-    # Slow, and asked for by either wheel.
+    # Slow, and used for both wheels.
     return no_fuse(jnp.arctan2, left, ahead) if left.ndim else jnp.arctan2(left, ahead)
 
 
 def nearer_end(bearing: Float[AnyArray, "*lanes"]) -> tuple[Lanes, Lanes]:
-    """Which end points at `bearing` sooner, +1 front or -1 rear, and the turn (rad) that brings it there."""
+    """The end nearer to `bearing` (rad), +1 front or -1 rear, and the turn (rad) that points it there."""
     behind = jnp.abs(bearing) > jnp.pi / 2.0
     turn = jnp.where(behind, bearing - jnp.where(bearing < 0.0, -jnp.pi, jnp.pi), bearing)
     return jnp.where(behind, -1.0, 1.0).astype(turn.dtype), turn
@@ -30,12 +30,11 @@ def turn_and_drive(
     period: Float[AnyArray, ""],
     turning_share: float = 1.0,
 ) -> Float[Array, "2 *lanes"]:
-    """Turn by `turn` (rad) and drive with what is left of the wheels; `end` +1 drives forward, -1 backward.
+    """Turn by `turn` (rad) and drive with the rest of the wheel speed; `end` +1 drives forward, -1 backward.
 
-    Within one control period the turn is exact when it can be: turning on at full speed past the wanted
-    heading would only make the robot chatter about it. `turning_share` bounds the part of the wheel speed
-    spent on turning: 1 turns in place for as long as the turn takes more than a period, 1/2 keeps the
-    inner wheel from running backward, so that the robot drives an arc.
+    The turn is exact if it fits into one control period, so that the heading does not oscillate.
+    `turning_share` limits the part of the wheel speed for turning: 1 turns in place while the turn takes more
+    than a period, 1/2 keeps the inner wheel from driving backward, so that the robot drives an arc.
     """
     fastest = turning_share * rim_speed / half_axle
     turn_rate = jnp.clip(turn / period, -fastest, fastest)

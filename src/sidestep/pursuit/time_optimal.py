@@ -1,22 +1,22 @@
-"""How long the evader lasts where the pursuer wins, and how both play for time.
+"""Time to capture where the pursuer wins, and optimal play of both sides in the game of time.
 
-After Ruiz, Murrieta-Cid, Marroquin, IEEE T-RO 2013; the closed forms here are our own derivation and are
-tested against Isaacs' equation. Lengths are in units of the half axle b and times in b/V inside this
-module, so that a game is two numbers: rho = v_e/V and lambda = l/b. By symmetry z lies in the quadrant
-x, y >= 0. The evader runs straight in the world; only on the axis does it bend. With s the bearing of
-its flight as the final straight drive begins (and of the contact, unless it was on the axis before):
+After Ruiz, Murrieta-Cid, Marroquin, IEEE T-RO 2013. The closed forms are derived here and tested against
+Isaacs' equation. Inside this module lengths are in units of the half axle b and times in b/V, so that a game
+is given by rho = v_e/V and lambda = l/b. By symmetry z lies in the quadrant x, y >= 0. The evader moves
+straight in the world, except on the axis. Let s be the bearing of its motion when the final straight drive
+begins (and of the contact, unless it was on the axis before):
 
 - **Drive.** z = ((lambda - rho tau) cos s + tau, (lambda - rho tau) sin s) at time to go tau, as long as
   driving beats turning: tau <= cot s. All these paths meet the axis at x = lambda/rho, tau = lambda/rho.
-- **Axis.** Beyond it the pursuer keeps the evader ahead, turning as much as that takes:
-  x' = -1 + rho sqrt(1 + 1/x^2), the evader pulling aside at tan s = 1/x; it comes from P(s) = (cot s, 0).
-- **Turn.** Before, the pursuer turns in place toward the evader, for a time t1, until the evader stands at
-  P(s): on the axis for s <= s_c = atan(rho/lambda), else where driving starts to beat turning. The
-  moment of the evader's line about the pursuer is conserved, and it is cos s: with phi its heading and
+- **Axis.** Beyond that the pursuer turns to keep the evader on its axis: x' = -1 + rho sqrt(1 + 1/x^2), while
+  the evader moves aside at tan s = 1/x. This phase begins at P(s) = (cot s, 0).
+- **Turn.** Before that, the pursuer turns in place towards the evader for a time t1, until the evader is at
+  P(s): on the axis for s <= s_c = atan(rho/lambda), else where driving begins to beat turning. The moment of
+  the evader's line about the pursuer is conserved and equals cos s: with phi the evader's heading and
   psi = phi - bearing of z, r sin psi = cos s, r cos psi + rho t1 = P(s).n(s), t1 = phi - s.
-- **Back off.** Closer than b and beside the pursuer, driving away from the side the evader flees to brings
-  it ahead faster than turning does, as long as phi > pi - s. In that frame z comes from the y axis on
-  straight lines along (1 - rho cos s, rho sin s).
+- **Back off.** Closer than b and beside the pursuer, driving away from the evader's half plane brings it
+  ahead faster than turning, as long as phi > pi - s. In that frame z comes from the y axis on straight lines
+  along (1 - rho cos s, rho sin s).
 
 The evader's direction n is that of the gradient of the time T, and Isaacs' equation
 v_e |grad T| - V max(|T_x|, |x T_y - y T_x|/b) = -1 gives the gradient's length.
@@ -41,9 +41,9 @@ class Play(eqx.Module):
     """Optimal play from one point of the pursuer's frame, in the game of time.
 
     **Attributes:** `time` to capture (s): 0 within the capture distance, infinite where capture cannot be
-    forced; `direction (2,)` in which the evader flees, a unit vector in the pursuer's frame; `backing`
-    and `turning`, how long (s) the pursuer first drives away from the evader's half plane and then turns
-    toward it; after that it drives at it. Where the time is infinite or zero only `time` means something.
+    forced; `direction (2,)` of the evader, a unit vector in the pursuer's frame; `backing` and `turning`, the
+    times (s) for which the pursuer first drives away from the evader's half plane and then turns towards it,
+    before it drives at it. Where the time is infinite or zero only `time` is meaningful.
     """
 
     time: Scalar
@@ -53,7 +53,8 @@ class Play(eqx.Module):
 
 
 class _Shape(eqx.Module):
-    """A game without units: rho = v_e/V, lambda = l/b, usable angle S, s_c at which P(s) leaves the axis."""
+    """The dimensionless game: rho = v_e/V, lambda = l/b, usable angle S, s_c at which P(s) leaves the
+    axis."""
 
     rho: Scalar
     size: Scalar
@@ -62,7 +63,7 @@ class _Shape(eqx.Module):
 
 
 def _reach(shape: _Shape, s: Scalar) -> Scalar:
-    """P(s).n(s): how far along its flight the evader is as the turning ends."""
+    """P(s).n(s): the evader's position along its line of motion when the turning ends."""
     cosine, sine = jnp.cos(s), jnp.sin(s)
     start = jnp.where(s < shape.corner, 0.0, shape.size - shape.rho * cosine / sine)
     return start + cosine**2 / sine
@@ -82,7 +83,7 @@ def _axis_integral(shape: _Shape, s: Scalar) -> Scalar:
 
 
 def _time_from_turn(shape: _Shape, s: Scalar) -> Scalar:
-    """Time to go at P(s), where the turning ends."""
+    """Time to capture from P(s), where the turning ends."""
     on_axis = s < shape.corner
     held = jnp.minimum(s, shape.corner)
     axis = shape.size / shape.rho + _axis_integral(shape, shape.corner) - _axis_integral(shape, held)
@@ -90,7 +91,7 @@ def _time_from_turn(shape: _Shape, s: Scalar) -> Scalar:
 
 
 def _bisect(negative: Callable[[Scalar], Bool[Array, ""]], low: Scalar, high: Scalar) -> Scalar:
-    """Where a function of one variable turns from `negative` to not, to the last bit that matters."""
+    """The point where `negative` changes from true to false, to floating-point precision."""
 
     def halve(_: Array, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = ends
@@ -121,11 +122,11 @@ def _unit(vector: Float[AnyArray, "2"]) -> Float[Array, "2"]:
 
 
 def _turn(shape: _Shape, z: Float[Array, "2"]) -> tuple[Scalar, Scalar, Scalar, Flag]:
-    """s, the heading phi of the evader's flight, the turning time t1, and whether turning comes first.
+    """s, the evader's heading phi, the turning time t1, and whether turning comes first.
 
-    Farther away than b the unknown is s itself, between S and a value so small that its flight starts
-    beyond z. Closer, a flight past the pursuer may have s twice, and the unknown is psi, between
-    the direction with s = S and the one along which backing off is as good as turning.
+    Farther away than b the unknown is s, between S and a value so small that its path starts beyond z.
+    Closer, a path past the pursuer may have two values of s. Then the unknown is psi, between the direction
+    with s = S and the one for which backing off is as fast as turning.
     """
     rho, usable = shape.rho, shape.usable
     distance, bearing = jnp.hypot(z[0], z[1]), jnp.arctan2(z[1], z[0])
@@ -133,7 +134,7 @@ def _turn(shape: _Shape, z: Float[Array, "2"]) -> tuple[Scalar, Scalar, Scalar, 
     safe = jnp.maximum(distance, jnp.finfo(distance.dtype).tiny)
     smallest = jnp.minimum(1.0 / (distance + jnp.pi * rho + 1.0), usable)
     nearest = jnp.arcsin(jnp.minimum(rho / safe, 1.0))
-    # From z to the wheel at (0, b): along it both ways of bringing the evader ahead are as fast.
+    # From z to the wheel at (0, b): along it turning and backing off are equally fast.
     to_wheel = jnp.arctan2(jnp.cos(bearing), jnp.sin(bearing) - distance)
 
     def flight(part: Scalar) -> tuple[Scalar, Scalar]:
@@ -154,7 +155,7 @@ def _turn(shape: _Shape, z: Float[Array, "2"]) -> tuple[Scalar, Scalar, Scalar, 
 
 
 def _back_off(shape: _Shape, z: Float[Array, "2"]) -> tuple[Scalar, Scalar]:
-    """s of the flight from z and the time t2 for which the pursuer backs off before it turns."""
+    """s of the evader's path from z, and the time t2 for which the pursuer backs off before it turns."""
     rho = shape.rho
 
     def ends_at(s: Scalar) -> Float[Array, "2"]:
@@ -166,7 +167,7 @@ def _back_off(shape: _Shape, z: Float[Array, "2"]) -> tuple[Scalar, Scalar]:
         gap = ends_at(s) - z
         return gap[0] * rho * jnp.sin(s) < gap[1] * (1.0 - rho * jnp.cos(s))
 
-    # At the lower end the turning would start behind the y axis, at the upper one the flight is the barrier.
+    # At the lower end the turning would start behind the y axis; at the upper end the path is the barrier.
     low = jnp.minimum(1.0 / (2.0 + jnp.pi * rho), shape.usable)
     s = _bisect(passes_above, low, shape.usable)
     return s, jnp.maximum((ends_at(s)[0] - z[0]) / (1.0 - rho * jnp.cos(s)), 0.0)
@@ -201,8 +202,8 @@ def time_optimal_play(
 ) -> Play:
     """Optimal play in the game of time at z (m, pursuer's frame); carries no derivatives.
 
-    An evader that can escape is caught only inside the capture set, by driving straight at it. A
-    pursuer with b = 0 points anywhere at once and drives: T = (r - l)/(V - v_e).
+    An evader that can escape is captured only inside the capture set, by driving straight at it. A pursuer
+    with b = 0 turns instantly and drives: T = (r - l)/(V - v_e).
     """
     arguments = (z, evader_speed, pursuer_speed, half_axle, capture_distance)
     z, evader_speed, pursuer_speed, half_axle, capture_distance = map(real, jax.lax.stop_gradient(arguments))
