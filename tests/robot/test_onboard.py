@@ -308,7 +308,7 @@ def test_the_plan_of_another_world_is_not_followed_after_a_jump_and_the_policy_i
 def test_a_core_that_keeps_falling_behind_goes_without_looking_ahead_until_it_keeps_pace(joint_core):
     core = joint_core
     core.reset()
-    with pytest.raises(ValueError, match="policy of its own"):
+    with pytest.raises(ValueError, match="has a policy and takes no nominal"):
         core.nominal(0.0, WISH)
     run(core, 3, without=("nominal",))
     for count in (5, 7, 9):

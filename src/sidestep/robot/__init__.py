@@ -1,4 +1,4 @@
-"""What does a robot run? A decision core without a transport: estimates, watchdog, shield, policy."""
+"""The decision core of a robot, without a transport: estimates, watchdog, shield, policy."""
 
 from sidestep.robot.core import Onboard
 from sidestep.robot.decision import LEVELS, Decision

@@ -1,4 +1,4 @@
-"""One call from numbers to numbers: policy and shield compiled together."""
+"""Policy and shield compiled into one call, from one vector to one vector."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from sidestep.world import Scenario, World
 Numbers = Float[np.ndarray, "n"]
 
 
-class Seen(NamedTuple):
-    """Where everything is thought to be when the command acts: the parts of a `World`."""
+class Estimate(NamedTuple):
+    """The estimated world at actuation time: the parts of a `World`."""
 
     evader: Numbers
     pursuers: Float[np.ndarray, "m 3"]
@@ -33,7 +33,7 @@ class Seen(NamedTuple):
     time: float
 
     def world(self) -> World:
-        """As the rest of the package knows it."""
+        """The estimate as a `World`."""
         with np.errstate(over="ignore"):  # As in `Answering`.
             return World(
                 self.evader,
@@ -47,7 +47,7 @@ class Seen(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What the shield answered: a `ShieldResult` with the nominal velocity and the clearance."""
+    """The shield's answer: a `ShieldResult` with the nominal velocity and the clearance."""
 
     nominal: Numbers
     action: Numbers
@@ -59,7 +59,7 @@ class Answer(NamedTuple):
 
     @classmethod
     def of(cls, vector: Numbers, count: int) -> Answer:
-        """From its parts, one after the other; `count` barriers."""
+        """The answer from its concatenated parts, with `count` barriers."""
         return cls(
             nominal=vector[:2],
             action=vector[2:4],
@@ -73,9 +73,9 @@ class Answer(NamedTuple):
 
 @final
 class Answering:
-    """A shield and a policy compiled into one call of one vector in and one out.
+    """A shield and a policy compiled into one call with one input vector and one output vector.
 
-    On small computers most of a decision's time is what it costs to hand many small arrays over.
+    On small computers, passing many small arrays takes most of a decision's time.
 
     `rows_only`: the shield decides by its rows, without looking ahead. The memory is the same.
     """
@@ -94,9 +94,9 @@ class Answering:
             parts = split(numbers)
             evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
             world = World(evader, pursuers, obstacles, target, time, velocity, wheels)
-            wished, ask, flee, delay = parts[7:]
+            given, ask, flee, delay = parts[7:]
             shield = shield.with_delay(delay)
-            nominal = _nominal(shield.scenario, policy, world, wished, ask, flee)
+            nominal = _nominal(shield.scenario, policy, world, given, ask, flee)
             result, memory = (shield.filter_by_rows if rows_only else shield)(world, nominal, memory)
             outcome = [nominal, result.action, result.status.astype(nominal.dtype), result.slack]
             outcome += [result.intervention, clearance(shield.scenario, world), result.barriers]
@@ -105,24 +105,28 @@ class Answering:
         self._compiled = answer
 
     def __call__(
-        self, world: Seen, wished: Numbers, ask: bool, flee: bool, delay: float, memory: Any
+        self, world: Estimate, given: Numbers, ask: bool, flee: bool, delay: float, memory: Any
     ) -> tuple[Answer, Any]:
-        """What was decided, and the next memory. `delay` (s) replaces the budget's."""
-        parts = (*world, wished, ask, flee, delay)
+        """The shield's answer and next memory.
+
+        `given`: the nominal velocity (m/s) unless the policy decides (`ask`) or the robot flees (`flee`).
+        `delay` (s) replaces the budget's.
+        """
+        parts = (*world, given, ask, flee, delay)
         numbers = np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in parts])
-        with np.errstate(over="ignore"):  # Infinite is what it is then, and no answer follows from it.
+        with np.errstate(over="ignore"):  # An overflow to infinity gives a non-finite answer.
             numbers = numbers.astype(real(0.0).dtype)
         vector, memory = self._compiled(self._arrays, numbers, memory)
         return Answer.of(np.asarray(vector, np.float64), self._count), memory
 
 
-def _nominal(scenario: Scenario, policy: Any, world: World, wished: Array, ask: Array, flee: Array) -> Array:
-    """The velocity (m/s) to filter: `ask` the policy, if there is one, instead of taking the wish; `flee`:
-    instead of either, full speed away from the nearest pursuer."""
-    nominal = wished
+def _nominal(scenario: Scenario, policy: Any, world: World, given: Array, ask: Array, flee: Array) -> Array:
+    """The nominal velocity (m/s): `given`, or the policy's with `ask`, or with `flee` full speed away from
+    the nearest pursuer."""
+    nominal = given
     if policy is not None:
-        nominal = jnp.where(ask > 0.0, decide(scenario, policy, world), wished)
-        # Policies are made for the way there, and an episode ends at the target: a robot stays.
+        nominal = jnp.where(ask > 0.0, decide(scenario, policy, world), given)
+        # Policies are trained on episodes that end at the target; there a robot must stand still.
         way = world.target - world.evader
         nominal = jnp.where(length(way[0], way[1]) <= scenario.reach_distance, 0.0, nominal)
     if scenario.pursuer_count:

@@ -1,7 +1,7 @@
-"""The decision core that a robot runs: poses and a wish go in, a safe velocity comes out, whatever happens.
+"""The decision core of a robot: from poses and a nominal velocity to a safe velocity, under any fault.
 
-It knows nothing of transports. Physics twin, ROS 2 node and robots of other kinds feed it poses with the time
-at which they were true, ask it once per control period, and drive what it answers.
+It is independent of transports. The twin, the ROS 2 node and other robots pass it poses with time stamps,
+call it once per control period, and drive the velocity it returns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from sidestep.learning import load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.step import decision_steps_of
-from sidestep.robot.answering import Answering, Numbers, Seen
+from sidestep.robot.answering import Answering, Estimate, Numbers
 from sidestep.robot.decision import LEVELS, Decision
 from sidestep.robot.estimates import Estimates
 from sidestep.robot.intake import Intake
@@ -32,28 +32,32 @@ from sidestep.world import Scenario, World
 
 @final
 class Onboard:
-    """Decides for one evader; see `OnboardSettings` for what it knows of its sensors and of faults.
+    """Decides for one evader. `OnboardSettings` describes its sensors, motors and reactions to faults.
 
-    Feed it with `see` and, without a policy, `nominal`; set `target` for a policy; call `decide` once per
-    control period and drive what it answers until the next. Times (s) are of one clock, the same for poses
-    and decisions. Not for several threads at once.
+    Pass poses with `see` and, without a policy, nominal velocities with `nominal`; set `target` for a policy.
+    Call `decide` once per control period and drive its velocity until the next call. All times (s) must be of
+    one clock. Not thread-safe.
 
-    **Arguments:** `shield` a name, or a shield of this scenario (then its own budget counts, not that of the
-    settings); `policy` None if nominal velocities are fed in, `goal-seeking`, a run folder, or any policy.
+    **Arguments:** `shield` a name, or a shield of this scenario (its budget then replaces that of the
+    settings); `policy` None if the caller passes nominal velocities, `goal-seeking`, a run folder, or any
+    policy.
 
-    **Reactions.** Poses that are no numbers, of the wrong length, not finite, too large, out of order, from
-    the future or jumps are dropped and counted. A pursuer's pose is allowed for by its age, or by
-    `budget.delay` if that is more. One older than usual means `degraded`; older than `stale_after`, `evade`
-    (the nominal velocity is ignored, the robot flees from the pursuer as last seen) or `stop`, as `on_fault`
-    says; without its own pose, or before every robot of the scenario has been seen, the robot stops. A lost
-    nominal velocity counts as zero. A core that is called late adds the lateness to the delay, and if it
-    happens again and again decides by the rows alone, without looking ahead, until it has kept pace for a
-    while. A clock that goes back stops the robot for that period; everything that has a time is forgotten,
-    and decisions go on as soon as poses and clock agree again. So they do after a pause, or a clock that
-    went ahead: then motions and the plan are forgotten.
+    **Reactions to faults.**
 
-    **Raises** `ValueError` or `TypeError` for settings, a shield, a policy or a target that cannot be, and
-    nothing for what is seen or for the time of a decision.
+    - Invalid poses are dropped and counted, see `Reading`.
+    - The delay of a pursuer's pose is its age, or `budget.delay` if that is larger.
+    - A pose older than usual gives level `degraded`. Older than `stale_after`, it gives `evade` (the robot
+      ignores the nominal velocity and flees from the pursuer's last pose) or `stop`, according to `on_fault`.
+    - The robot stops without a recent pose of itself, and until every robot of the scenario has been seen.
+    - A lost nominal velocity counts as zero.
+    - If `decide` is called late, the lateness is added to the delay. If that happens repeatedly, the shield
+      decides by its rows, without looking ahead, until calls are on time again.
+    - If the clock goes back, the robot stops for that period and all stamped data is forgotten. Decisions
+      resume when poses and clock agree again.
+    - After a pause, or a clock that jumped ahead, motions and the plan are forgotten.
+
+    **Raises** `ValueError` or `TypeError` for invalid settings, shield, policy or target; nothing for invalid
+    poses or times.
     """
 
     def __init__(
@@ -73,7 +77,7 @@ class Onboard:
         if isinstance(shield, str):
             budget = settings.budget if shield in PURSUIT_SHIELDS else None
             shield = make_shield(shield, scenario, budget)
-            # Motors that turn the robot round within a period are as good as none.
+            # Motors that reverse the velocity within a period need no model.
             gained = settings.motor_acceleration * float(scenario.control_period)
             if gained < 2.0 * float(scenario.evader_speed):
                 shield = shield.with_acceleration(settings.motor_acceleration)
@@ -91,11 +95,12 @@ class Onboard:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all poses, wishes, faults and commands; keep what was compiled, and the target."""
+        """Forget all poses, nominal velocities, faults and commands; keep the compiled programs and the
+        target."""
         self._estimates = Estimates(self.scenario, self.settings)
         self._pace = Pace(self._period, self.settings)
         self._intake = Intake(self._period + self.settings.future_tolerance)
-        self._wish: tuple[float, Numbers] | None = None
+        self._last_nominal: tuple[float, Numbers] | None = None
         self._held = np.full(2, np.nan)
         self._now: float | None = None
         self._decided = 0
@@ -103,13 +108,13 @@ class Onboard:
 
     @property
     def counts(self) -> Counter[tuple[str, Reading]]:
-        """What became of the poses of each robot (`evader`, `pursuer 0`, ...), of nominal velocities
-        (`nominal`) and of times of decisions that could not be used (`clock`), since the last `reset`."""
+        """Counts per source and `Reading` since the last `reset`: poses of each robot (`evader`, `pursuer 0`,
+        ...), nominal velocities (`nominal`), and invalid times of decisions (`clock`)."""
         return self._intake.counts
 
     @property
     def target(self) -> Float[np.ndarray, "2"]:
-        """Where the policy is to go, m, world axes."""
+        """The policy's target, m, world axes."""
         return self._target.copy()
 
     @target.setter
@@ -120,11 +125,13 @@ class Onboard:
         self._target = point
 
     def see(self, robot: Any, stamp: Any, pose: Any, index: Any = 0, *, now: Any = None) -> Reading:
-        """A pose of `evader`, `pursuer` or `obstacle`: x, y (m) and, but for obstacles, heading (rad).
+        """Pass a pose of `evader`, `pursuer` or `obstacle`: x, y (m) and heading (rad; optional for
+        obstacles).
 
-        `stamp` (s) is when it was true. `now`: the clock (s), to know a stamp from the future. Without it a
-        stamp more than a period ahead of the last decision waits for the next one (`Reading.WAITING`), and
-        one more than a second ahead is refused. Raises nothing: what cannot be used is counted.
+        `stamp` (s) is the time of the measurement. `now`, the clock (s), detects stamps from the future.
+        Without it, a stamp more than a period ahead of the last decision waits for the next one
+        (`Reading.WAITING`), and one more than 1 s ahead is refused. Invalid input is counted; nothing is
+        raised.
         """
         gate = self._estimates.gate(robot, index)
         if gate is None:
@@ -133,33 +140,33 @@ class Onboard:
         return self._intake.judge(gate.name, gate.take, stamp, as_numbers(pose, *shapes), now, self._now)
 
     def nominal(self, stamp: Any, velocity: Any, *, now: Any = None) -> Reading:
-        """A wished velocity (m/s, world axes), given at `stamp` (s); only without a policy. `now` and what
-        cannot be used: as for `see`.
+        """Pass a nominal velocity (m/s, world axes) of time `stamp` (s); only without a policy. `now` and
+        invalid input as for `see`.
 
-        **Raises** `ValueError` where a policy decides, whatever is given.
+        **Raises** `ValueError` if the core has a policy.
         """
         if self._policy is not None:
-            raise ValueError("this core has a policy of its own: it takes no nominal velocity")
+            raise ValueError("this core has a policy and takes no nominal velocity")
         numbers = as_numbers(velocity, (2,))
-        return self._intake.judge("nominal", self._take_wish, stamp, numbers, now, self._now)
+        return self._intake.judge("nominal", self._take_nominal, stamp, numbers, now, self._now)
 
-    def _take_wish(self, stamp: float, velocity: Numbers, now: float | None) -> Reading:
+    def _take_nominal(self, stamp: float, velocity: Numbers, now: float | None) -> Reading:
         if np.any(np.abs(velocity) > LARGEST):
             return Reading.TOO_LARGE
         if now is not None and stamp > now + self.settings.future_tolerance:
             return Reading.FROM_THE_FUTURE
-        if self._wish is not None and stamp < self._wish[0]:
+        if self._last_nominal is not None and stamp < self._last_nominal[0]:
             return Reading.OUT_OF_ORDER
-        self._wish = (stamp, velocity)
+        self._last_nominal = (stamp, velocity)
         return Reading.ACCEPTED
 
     def warm_up(self) -> float:
-        """Compile what decisions need, the fall-back included; returns the seconds it took."""
+        """Compile everything that decisions need, including the fallback; returns the seconds it took."""
         begun = time.perf_counter()
         m, k = self.scenario.pursuer_count, self.scenario.obstacle_count
         place = np.zeros(2)
         still = place, np.zeros((m, 2)), 0.0
-        seen = Seen(place, np.full((m, 3), 1.0), np.full((k, 4), 2.0), place + 1.0, *still)
+        seen = Estimate(place, np.full((m, 3), 1.0), np.full((k, 4), 2.0), place + 1.0, *still)
         memory = self._init(seen.world())
         self._whole(seen, place, True, False, 0.0, memory)
         if self._rows is not None:
@@ -167,19 +174,19 @@ class Onboard:
         return time.perf_counter() - begun
 
     def decide(self, now: Any) -> Decision:
-        """The command for the period that begins at `now` (s). Raises nothing: at a time that is none, or not
-        after the one before, the robot stands still for the period."""
+        """The command for the period that begins at `now` (s). Raises nothing: if the time is invalid, or not
+        later than the previous one, the robot stops for the period."""
         begun = time.perf_counter()
         clock = as_numbers(now, ())
         if isinstance(clock, Reading):
             self.counts[("clock", clock)] += 1
             words = f"the clock cannot be used ({clock.value}): stopped for this period"
-            return self._stop([*self._intake.told(), words], begun)
+            return self._stop([*self._intake.take_news(), words], begun)
         now = float(clock)
         if self._now is not None and now <= self._now:
             return self._stop(self._turned_back(now), begun, now)
         self._intake.settle(now)
-        reactions = self._intake.told()
+        reactions = self._intake.take_news()
         self._forget_ahead(now, reactions)
         lateness = self._paced(now, reactions)
         level = int(self._pace.late or self._pace.behind)
@@ -193,7 +200,7 @@ class Onboard:
         level = max(level, grade)
         if level == LEVELS.index("stop"):
             return self._stop(reactions, begun, now)
-        wished, lost = self._wished(now, reactions)
+        given, lost = self._given_nominal(now, reactions)
         level = max(level, int(lost))
         seen = self._estimate(acts)
         if self._memory is None:
@@ -202,7 +209,7 @@ class Onboard:
         ask = self._decided % self._decision_steps == 0
         flee = level >= LEVELS.index("evade")
         answering = (self._rows if self._pace.behind else None) or self._whole
-        answer, memory = answering(seen, wished, ask, flee, delay, self._memory)
+        answer, memory = answering(seen, given, ask, flee, delay, self._memory)
         self._memory = memory
         if not np.all(np.isfinite(answer.action)):
             self._forget_plan()
@@ -230,41 +237,44 @@ class Onboard:
         )
 
     def _turned_back(self, now: float) -> list[str]:
-        """The clock goes back to `now` (s), or stands still: what happened and was forgotten, in words."""
+        """Handle a clock that goes back to `now` (s), or stands still; returns the reactions."""
         assert self._now is not None
         back, self._now = self._now - now, now
         self.counts[("clock", Reading.OUT_OF_ORDER)] += 1
         if not back:
-            return [*self._intake.told(), f"the clock stands still at {now:.6g} s: stopped for this period"]
-        # No stamp from before compares with those that follow: a robot last seen a minute ago could seem
-        # to have been seen just now.
+            return [
+                *self._intake.take_news(),
+                f"the clock stands still at {now:.6g} s: stopped for this period",
+            ]
+        # Old stamps are not comparable with new ones: a robot last seen a minute ago could appear to have
+        # been seen just now.
         self._estimates.forget()
-        self._wish = None
+        self._last_nominal = None
         self._forget_plan()
         self._pace.interrupted()
         self._intake.settle(now)
         forgotten = "poses, motions, nominal velocity and plan are forgotten"
         words = f"the clock went back by {back:.6g} s: {forgotten}; stopped for this period"
-        return [*self._intake.told(), words]
+        return [*self._intake.take_news(), words]
 
     def _forget_ahead(self, now: float, reactions: list[str]) -> None:
-        """Forget what was believed before the clock was known, and turns out to be from its future."""
+        """Forget data accepted before the clock was known whose stamps prove to be from the future."""
         latest = self._intake.latest(now)
         names = self._estimates.forget(beyond=latest)
-        if self._wish is not None and self._wish[0] > latest:
-            self._wish = None
+        if self._last_nominal is not None and self._last_nominal[0] > latest:
+            self._last_nominal = None
             names.append("nominal")
         for name in names:
             self.counts[(name, Reading.FROM_THE_FUTURE)] += 1
             reactions.append(f"{name}: its stamp is ahead of the clock, forgotten")
 
     def _forget_plan(self) -> None:
-        """Sides, plan and the policy's last wish are those of another world: begin anew, the policy asked."""
+        """Forget sides and plan, and have the policy decide next, because the world has changed."""
         self._memory = None
         self._decided += -self._decided % self._decision_steps
 
     def _paced(self, now: float, reactions: list[str]) -> float:
-        """What to allow for (s) since decisions come late; after a pause, what was kept in mind goes."""
+        """The lateness of decisions (s) to add to the delay; after a pause sides and plan are forgotten."""
         late = self._pace.called(now)
         if self._pace.paused:
             self.counts[("clock", Reading.JUMP)] += 1
@@ -278,13 +288,13 @@ class Onboard:
         return self._pace.lateness
 
     def _ages(self, now: float, reactions: list[str]) -> tuple[float, int]:
-        """From the oldest pursuer's pose to when the command acts (s), and the level that all ages leave."""
+        """The largest delay (s) of a pursuer's pose, and the level according to the ages of all poses."""
         settings, level, delay = self.settings, 0, 0.0
         usual = max(float(settings.budget.delay) - settings.response, 0.0) + self._period
         for robot, gate in self._estimates:
             assert gate.track.stamp is not None
             age = now - gate.track.stamp
-            # Evader and obstacles are where their known motion has taken them.
+            # Evader and obstacles are extrapolated by their known motion.
             if robot == "pursuer":
                 delay = max(delay, self._unpredicted(age))
             if age <= usual:
@@ -301,36 +311,37 @@ class Onboard:
         return delay, level
 
     def _unpredicted(self, age: float) -> float:
-        """The delay (s) that a pursuer's pose of this age is to be paid for."""
+        """The delay (s) in the budget for a pursuer's pose of this age (s)."""
         settings = self.settings
         if not settings.predict_pursuer:
             return age + settings.response
-        # Driven on to when the command acts; what that is worth fades with the age.
+        # The pose is extrapolated to actuation time, less reliably with age.
         return float(settings.budget.delay) + max(age - self._period, 0.0)
 
-    def _wished(self, now: float, reactions: list[str]) -> tuple[Numbers, bool]:
-        """The wish to filter, and whether it was lost; a policy's is computed with the decision."""
+    def _given_nominal(self, now: float, reactions: list[str]) -> tuple[Numbers, bool]:
+        """The nominal velocity (m/s), and whether it was lost. With a policy it is the one held from the last
+        decision."""
         if self._policy is not None:
             return self._held, False
-        if self._wish is None:
+        if self._last_nominal is None:
             reactions.append("no nominal velocity yet: holding still unless pressed")
             return np.zeros(2), True
-        stamp, wished = self._wish
+        stamp, velocity = self._last_nominal
         if now - stamp > self.settings.nominal_timeout:
             age = 1e3 * (now - stamp)
             reactions.append(f"nominal velocity lost, {age:.0f} ms old: holding still unless pressed")
             return np.zeros(2), True
-        return wished, False
+        return velocity, False
 
     def world(self, now: Any) -> World | None:
-        """Where everything is thought to be when a command given at `now` (s) acts; None before every robot
-        has been seen, and for a time that is none."""
+        """The estimated world when a command given at `now` (s) acts; None before every robot has been seen,
+        and for an invalid time."""
         clock = as_numbers(now, ())
         if isinstance(clock, Reading) or self._estimates.unseen():
             return None
         return self._estimate(float(clock) + self.settings.response).world()
 
-    def _estimate(self, acts: float) -> Seen:
+    def _estimate(self, acts: float) -> Estimate:
         with np.errstate(all="ignore"):
             return self._estimates.at(acts, self._target, self._decided * self._period)
 

@@ -1,4 +1,4 @@
-"""What the decision core answers."""
+"""The decision core's answer."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from jaxtyping import Float
 from sidestep.world import World
 
 LEVELS = ("normal", "degraded", "evade", "stop")
-"""How much is left, from everything to nothing."""
+"""Levels of operation, from normal to stopped."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One command and how it came about.
+    """One command, with the data of its decision.
 
-    - `velocity (2,)` to drive now, m/s, world axes: finite and within the speed limit, never unfiltered
-    - `nominal (2,)` what the policy or the caller wished, m/s; NaN where there was none
-    - `status` see `sidestep.safety.Status`; `INVALID` where nothing could be decided
-    - `level` one of `LEVELS`; `reactions` each fault met and what was done about it
+    - `velocity (2,)` to drive now, m/s, world axes: finite, within the speed limit, always filtered
+    - `nominal (2,)` velocity of the policy or the caller, m/s; NaN if there was none
+    - `status` see `sidestep.safety.Status`; `INVALID` if no decision was possible
+    - `level` one of `LEVELS`; `reactions`: each fault and the reaction to it, in words
     - `barriers (m + k,)` h in m; `slack` m/s; `intervention` |velocity - nominal| in m/s; `clearance` least
       distance (m) to contact, as estimated
     - `latency` from the newest pose used to the end of the decision, s; `compute_seconds` of it spent here
@@ -44,11 +44,11 @@ class Decision:
 
     @property
     def world(self) -> World | None:
-        """The estimate decided on, at the time when the command acts; None where there was none."""
+        """The estimated world at actuation time, on which the decision is based; None if there was none."""
         return None if self._seen is None else self._seen.world()
 
     @property
     def plan(self) -> Float[np.ndarray, "n 2"]:
-        """Where the way out that the shield `joint` counts on leads, m, against a pursuer that plays `nash`:
-        computed when asked for. Empty for other shields, and where nothing could be decided."""
+        """Positions (m) along the escape plan of the shield `joint` against a pursuer that plays `nash`,
+        computed on access. Empty for other shields, and if no decision was possible."""
         return self._plan()

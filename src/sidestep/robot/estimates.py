@@ -1,4 +1,4 @@
-"""Where is everything, as far as the poses tell?"""
+"""The estimated world, from the poses of all robots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from sidestep.robot.answering import Numbers, Seen
+from sidestep.robot.answering import Estimate, Numbers
 from sidestep.robot.readings import Gate
 from sidestep.robot.settings import OnboardSettings
 from sidestep.robot.tracks import EvaderTrack, ObstacleTrack, PursuerTrack
@@ -48,41 +48,41 @@ class Estimates:
         }
 
     def __iter__(self) -> Iterator[tuple[str, Gate]]:
-        """Every gate, with the kind of its robot."""
+        """All gates, with the kinds of their robots."""
         return ((robot, gate) for robot, gates in self._gates.items() for gate in gates)
 
     def gate(self, robot: Any, index: Any) -> Gate | None:
-        """That of a robot; None for anything that the scenario does not have."""
+        """The gate of a robot; None for a robot that the scenario does not have."""
         gates = self._gates.get(robot, []) if isinstance(robot, str) else []
         try:
             number = operator.index(index)
-        except Exception:  # Whatever an object of somebody's raises: it is no number of a robot.
+        except Exception:  # A caller's object may raise anything; it is not a valid index.
             return None
         return gates[number] if 0 <= number < len(gates) else None
 
     def unseen(self) -> list[str]:
-        """The robots of which nothing is known."""
+        """Names of the robots without a pose."""
         return [gate.name for _, gate in self if gate.track.stamp is None]
 
     def newest(self) -> float:
-        """When the newest pose was true, s."""
+        """The stamp (s) of the newest pose."""
         stamps = [gate.track.stamp for _, gate in self if gate.track.stamp is not None]
         return max(stamps, default=-math.inf)
 
     def forget(self, beyond: float = -math.inf) -> list[str]:
-        """Forget all robots seen later than `beyond` (s), as if they had never been; returns their names."""
+        """Forget all robots whose last stamp is later than `beyond` (s); returns their names."""
         late = [gate for _, gate in self if gate.track.stamp is not None and gate.track.stamp > beyond]
         for gate in late:
             gate.forget()
         return [gate.name for gate in late]
 
-    def at(self, acts: float, target: Numbers, time: float) -> Seen:
-        """Everything as it should be when the command acts; pursuers as last seen unless predicted. `target`
-        and `time` are passed on."""
+    def at(self, acts: float, target: Numbers, time: float) -> Estimate:
+        """The estimate at time `acts` (s); pursuers at their last poses unless predicted. `target` (m) and
+        `time` (s) are passed on."""
         pursuers = [track.at(acts if self._predict else -math.inf) for track in self._pursuers]
         obstacles = [np.concatenate([track.at(acts), track.velocity]) for track in self._obstacles]
         wheels = [track.wheel_speeds() for track in self._pursuers]
-        return Seen(
+        return Estimate(
             evader=self.evader.at(acts)[:2],
             pursuers=np.array(pursuers).reshape(-1, 3),
             obstacles=np.array(obstacles).reshape(-1, 4),

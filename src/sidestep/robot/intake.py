@@ -1,4 +1,4 @@
-"""What became of all that was handed in?"""
+"""Check and count all input of the decision core."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from jaxtyping import Float
 from sidestep.robot.readings import Reading, as_numbers
 
 _AHEAD = 1.0
-"""A stamp farther ahead (s) of the last decision is from the future, as far as anybody can tell."""
+"""Without a clock, a stamp farther ahead (s) of the last decision counts as from the future."""
 _NAMES = 1000
-"""So many robots that the scenario does not have are counted by name; further ones together."""
+"""Number of unknown robots that are counted by name; further ones are counted together."""
 _WORDS = {
     Reading.RELOCATED: "is somewhere else now, its track begins anew",
     Reading.RESUMED: "seen again after a while, its motion from before is forgotten",
@@ -24,10 +24,9 @@ _WORDS = {
 
 @final
 class Intake:
-    """Has poses and nominal velocities judged, as soon as it is known what time it is, and counts them.
+    """Passes poses and nominal velocities to their checks, as soon as the clock is known, and counts results.
 
-    `tolerance` (s): how far a stamp may be ahead of the last decision and be surely not from the future of
-    the next.
+    `tolerance` (s): a stamp ahead of the last decision by at most this is not from the future.
     """
 
     def __init__(self, tolerance: float):
@@ -37,7 +36,7 @@ class Intake:
         self._waiting: list[tuple[str, Callable[[float], Reading]]] = []
 
     def latest(self, now: float) -> float:
-        """The latest stamp (s) that may be believed without a clock, after a decision at `now` (s)."""
+        """The latest stamp (s) to accept without a clock, after a decision at `now` (s)."""
         return now + self._tolerance
 
     def judge(
@@ -49,8 +48,8 @@ class Intake:
         now: Any,
         last: float | None,
     ) -> Reading:
-        """Judge numbers by `take(stamp, numbers, now)`; if the clock `now` is not known, and it depends on
-        it, when the next decision comes. `last`: the clock (s) at the last decision."""
+        """Check numbers with `take(stamp, numbers, now)`. If the result depends on the clock and `now` is not
+        given, this happens at the next decision. `last`: the clock (s) at the last decision."""
         when, clock = as_numbers(stamp, ()), as_numbers(now, ())
         if isinstance(when, Reading):
             return self.count(name, when)
@@ -67,26 +66,26 @@ class Intake:
         return self.count(name, take(time, numbers, None))
 
     def settle(self, now: float) -> None:
-        """Judge what waited for the clock."""
+        """Check the input that waited for the clock."""
         for name, take in self._waiting:
             self.count(name, take(now))
         self._waiting.clear()
 
     def count(self, name: str, reading: Reading) -> Reading:
-        """Count one more; it is told of unless it is simply accepted."""
+        """Count one reading; `take_news` reports it unless it was `ACCEPTED`."""
         self.counts[(name, reading)] += 1
         if reading is not Reading.ACCEPTED:
             self._news[(name, reading)] += 1
         return reading
 
     def unknown(self, robot: Any, index: Any) -> Reading:
-        """Count what came of a robot that the scenario does not have, whatever somebody sent as its name."""
+        """Count a pose of a robot that the scenario does not have. Its name may be any object."""
         named = isinstance(robot, str) and isinstance(index, (int, np.integer)) and abs(index) < 1e9
         name = f"{robot[:40]} {index}" if named and len(self.counts) < _NAMES else "some robot"
         return self.count(name, Reading.UNKNOWN_ROBOT)
 
-    def told(self) -> list[str]:
-        """What was not used since this was last asked, and what began anew, in words."""
+    def take_news(self) -> list[str]:
+        """Dropped input and restarted tracks since the last call, in words."""
         words = [
             f"{name}: {_WORDS.get(reading) or f'{count} {reading.value}, dropped'}"
             for (name, reading), count in sorted(self._news.items(), key=lambda item: item[0][0])

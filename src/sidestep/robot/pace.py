@@ -1,4 +1,4 @@
-"""Does the decision core keep pace with its control period?"""
+"""Lateness of decisions with respect to the control period."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import final
 from sidestep.robot.settings import OnboardSettings
 
 _CALM = 20
-"""On-time decisions after which a core that fell behind looks ahead again."""
+"""Number of on-time decisions after which a core that fell behind looks ahead again."""
 
 
 @final
 class Pace:
-    """How late decisions are, of late.
+    """Tracks the lateness of recent decisions.
 
-    - `lateness` (s) to allow for: that of this decision, or of earlier ones as far as not forgotten
-    - `late` whether this decision is; `paused` whether by so much that it is no lateness, but a pause, or the
-      clock was set ahead; `behind` whether so many were late that less must be computed
+    - `lateness` (s) to add to the delay: of this decision, or of earlier ones, which decays
+    - `late`: whether this decision is late; `paused`: whether so late that there was a pause, or the clock
+      was set ahead; `behind`: whether so many decisions were late that computation must be reduced
     """
 
     def __init__(self, period: float, settings: OnboardSettings):
@@ -30,11 +30,11 @@ class Pace:
         return self._late_in_a_row > 0
 
     def interrupted(self) -> None:
-        """The time until the next decision says nothing: the clock was set meanwhile."""
+        """Ignore the time until the next decision, because the clock was set."""
         self._since = None
 
     def called(self, now: float) -> float:
-        """To be called for each decision, at `now` (s), later than the one before; how late it is, s."""
+        """Register a decision at `now` (s), later than the previous one; returns its lateness, s."""
         since, self._since, self.paused = self._since, now, False
         if since is None:
             return 0.0
@@ -49,8 +49,8 @@ class Pace:
         elif self.behind and self._on_time >= _CALM:
             self.behind = False
         self.paused = elapsed > settings.forgotten_after(self._period)
-        # No delay pays for a pause: poses that are as old as that are stale.
+        # A pause is not added to the delay: poses of that age are stale.
         paid = min(late, settings.stale_after) if self.paused else late
-        # What was late once may be so again: forgotten over some periods.
+        # Lateness may recur, so it decays over several periods.
         self.lateness = max(paid, 0.8 * self.lateness if self.lateness > 1e-4 else 0.0)
         return late

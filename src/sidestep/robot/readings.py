@@ -1,4 +1,4 @@
-"""May what was handed in be believed?"""
+"""Check poses and other input of the decision core."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from sidestep.robot.settings import OnboardSettings
 from sidestep.robot.tracks import Track, turned
 
 LARGEST = 1e4
-"""The largest position (m) and speed (m/s) to be used: beyond, single precision errs by more than 1 mm."""
+"""The largest valid position (m) and speed (m/s): beyond, float32 errs by more than 1 mm."""
 
 
 class Reading(enum.Enum):
-    """What became of a pose, a nominal velocity or a time that was handed in.
+    """The result of checking a pose, a nominal velocity or a time.
 
-    Only `ACCEPTED`, `RELOCATED` and `RESUMED` are used; others change nothing and are counted.
+    Only `ACCEPTED`, `RELOCATED` and `RESUMED` input is used. All other input is counted and has no effect.
     """
 
     ACCEPTED = "accepted"
     RELOCATED = "somewhere else"
-    """Believed, in a place that the robot cannot have driven to: its track begins anew there."""
+    """Accepted although the robot cannot have driven there; its track restarts."""
     RESUMED = "seen again"
-    """Believed, after so long a time that the robot's motion from before says nothing."""
+    """Accepted after a long time; the robot's earlier motion is forgotten."""
     WAITING = "waiting for the next decision"
-    """Only the next decision knows the clock that tells whether it is from the future."""
+    """The clock of the next decision tells whether it is from the future."""
     NOT_NUMBERS = "not numbers"
     WRONG_LENGTH = "of the wrong length"
     NOT_FINITE = "not finite"
@@ -40,15 +40,15 @@ class Reading(enum.Enum):
 
     @property
     def used(self) -> bool:
-        """Whether decisions are made on it."""
+        """Whether decisions use the input."""
         return self in (Reading.ACCEPTED, Reading.RELOCATED, Reading.RESUMED)
 
 
 def as_numbers(value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."] | Reading:
-    """What was handed in as finite numbers of one of the shapes, or why it cannot be. Raises nothing."""
+    """The value as finite numbers of one of the shapes, or the reason why it is not. Raises nothing."""
     try:
         found = np.asarray(value)
-    except Exception:  # Whatever an object of somebody's raises: it is no array of numbers.
+    except Exception:  # A caller's object may raise anything; it is not an array of numbers.
         return Reading.NOT_NUMBERS
     if found.dtype.kind not in "iuf":
         return Reading.NOT_NUMBERS
@@ -61,12 +61,11 @@ def as_numbers(value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]
 
 @final
 class Gate:
-    """Lets poses of one robot pass to its track.
+    """Checks the poses of one robot and passes valid ones to its track.
 
-    A robot that makes `speed` (m/s) and turns at `turn_rate` (rad/s) can only be so far from where it was. A
-    pose from beyond that is a jump; once `jump_confirmations` in a row agree with each other it was the track
-    that was wrong, or somebody has carried the robot, and the track begins anew. It does so, too, at the
-    first pose after more than `forgotten_after` (s).
+    A pose is a jump if the robot cannot have reached it with `speed` (m/s) and `turn_rate` (rad/s). When
+    `jump_confirmations` jumps in a row agree with each other, the track was wrong or the robot was carried,
+    and the track restarts there. It also restarts at the first pose after more than `forgotten_after` (s).
     """
 
     def __init__(
@@ -85,12 +84,12 @@ class Gate:
         self._agreed = 0
 
     def forget(self) -> None:
-        """The robot has never been seen."""
+        """Forget all poses."""
         self.track.forget()
         self._elsewhere, self._agreed = None, 0
 
     def take(self, stamp: float, pose: Float[np.ndarray, "d"], now: float | None) -> Reading:
-        """Judge a pose and, if it is believed, hand it on. `now`: the clock (s), as far as it is known."""
+        """Check a pose and, if it is valid, pass it to the track. `now`: the clock (s), if known."""
         if np.any(np.abs(pose[:2]) > LARGEST):
             return Reading.TOO_LARGE
         if len(pose) == 3 and abs(pose[2]) > LARGEST:

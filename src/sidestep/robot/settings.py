@@ -1,4 +1,4 @@
-"""What a robot is told about its sensors, its motors, and what to do when something fails."""
+"""Settings of the decision core: sensors, motors, and reactions to faults."""
 
 from __future__ import annotations
 
@@ -9,30 +9,36 @@ from sidestep._bounds import bounded, check, one_of
 from sidestep.safety import Budget
 
 ON_FAULT = ("evade", "stop")
-"""What to do when nothing better is left: flee from where the pursuer was last seen, or stand still."""
+"""Reactions to a stale pose of another robot: flee from the pursuer's last pose, or stop."""
 
 
 @dataclass(frozen=True)
 class OnboardSettings:
-    """How the decision core takes its input and answers faults.
+    """How the decision core models sensors and motors, and reacts to faults.
 
-    **Errors.** `budget` bounds what the rows must allow for. `position_noise` (m) and `heading_noise`
-    (rad) are standard deviations of the poses, for the filters that average them. `actuation_delay` (s)
-    is the part of the delay that passes between a decision and the motors. They then go to the velocity
-    told with the time constant `motor_lag` (s), and no faster than `motor_acceleration` (m/s^2). The own
-    motion is predicted with these, and `joint` looks ahead with that acceleration; a command is taken to
-    act `actuation_delay + motor_lag` late, and a pursuer's pose is paid for by its age and that, or by
-    `budget.delay` if that is more. `predict_pursuer`: drive the pursuer on to then, at the speeds that it
-    seems to have, and pay for `budget.delay` and what a pose is older than a period. What is guaranteed
-    holds without (an old pose is the same game); with it, a pursuer that drives steadily is met better
-    and one that turns round within the delay worse. An obstacle's drift is taken to wander by
-    `obstacle_acceleration` (m/s per root second).
+    **Errors and motors**
 
-    **Faults.** A robot's pose older than `stale_after` (s), or a decision core that was called late
-    `late_limit` times running (later than `late_after` periods), is a fault. `on_fault` says what is left.
-    `nominal_timeout` (s): a wish older than that counts as a wish to stand still. A pose farther than
-    `jump_tolerance` (m; `heading_tolerance` rad) from where the robot can be is not believed before
-    `jump_confirmations` agree on it. A stamp more than `future_tolerance` (s) ahead of the clock is refused.
+    - `budget`: bounds of the errors that the shield's rows account for
+    - `position_noise` (m), `heading_noise` (rad): standard deviations of the poses, for the filters
+    - `actuation_delay` (s): from a decision to the motors
+    - `motor_lag` (s), `motor_acceleration` (m/s^2): the motors follow the commanded velocity with this time
+      constant and limit. They predict the evader's motion, and `joint` looks ahead with the acceleration.
+      Actuation time is `actuation_delay + motor_lag` after a decision. The delay of a pursuer's pose is its
+      age plus that, or `budget.delay` if that is larger
+    - `predict_pursuer`: extrapolate the pursuer to actuation time with its estimated speeds. The delay is
+      then `budget.delay` plus the age beyond one control period. Better against a steady pursuer, worse
+      against a turning one; the guarantee holds only when off
+    - `obstacle_acceleration` (m/s per root second): random walk of an obstacle's velocity
+
+    **Faults**
+
+    - `stale_after` (s): an older pose is a fault; `on_fault`: the reaction
+    - `late_after` (periods), `late_limit`: a decision later than this is late; so many late decisions in a
+      row are a fault
+    - `nominal_timeout` (s): an older nominal velocity counts as zero
+    - `jump_tolerance` (m), `heading_tolerance` (rad): a pose farther than this from the reachable ones is
+      accepted only after `jump_confirmations` poses agree
+    - `future_tolerance` (s): a stamp farther ahead of the clock is refused
     """
 
     budget: Budget = field(default_factory=Budget)
@@ -57,11 +63,11 @@ class OnboardSettings:
         check(self, title="onboard settings: ")
 
     def forgotten_after(self, period: float) -> float:
-        """For how long (s) motions, sides and plans may go without a pose or a decision before they say
-        nothing any more: a second, or `stale_after` or four control periods (s) if that is more."""
+        """Time (s) without a pose or a decision after which motions, sides and plans are forgotten: the
+        largest of 1 s, `stale_after` and four control periods of `period` (s)."""
         return max(1.0, self.stale_after, 4.0 * period)
 
     @property
     def response(self) -> float:
-        """From a decision to when its command acts, s."""
+        """Time (s) from a decision to its actuation."""
         return self.actuation_delay + self.motor_lag

@@ -1,8 +1,7 @@
-"""Where are the robots now, and how do they move, as told by poses that err and come late?
+"""Estimates of the robots' motion from noisy, delayed poses: one Kalman filter per robot, in world axes.
 
-One Kalman filter per robot, in the world's axes. Each holds its estimate at the stamp of the last pose that
-it took; what is between that stamp and now is the caller's to ask for. In NumPy, because the filters are tiny
-and are fed one pose at a time.
+A filter holds its estimate at the stamp of its last pose; `at` extrapolates it. Written in NumPy, because the
+filters are tiny and get one pose at a time.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 _REACTION = 1.0
-"""Within about this time (s) a pursuer's wheels go from rest to full speed, as far as its filter knows: some
-do so at once, but rarely, and of headings that err by half a degree a fifth less is left than with 0.25 s."""
+"""Time (s) in which the filter assumes a pursuer's wheels reach full speed. Some pursuers are faster, but
+rarely; with heading noise of half a degree the estimate's error is a fifth less than with 0.25 s."""
 
 
 def turned(angle: float) -> float:
@@ -26,35 +25,36 @@ def turned(angle: float) -> float:
 
 
 class Track(abc.ABC):
-    """What is known of one robot: nothing until the first pose, see `stamp`."""
+    """The estimate of one robot; none before the first pose, see `stamp`."""
 
     stamp: float | None = None
-    """When the last pose that was taken was true, s."""
+    """The stamp (s) of the last pose; None before the first."""
 
     def forget(self) -> None:
-        """Nothing is known until the next `start`."""
+        """Discard the estimate until the next `start`."""
         self.stamp = None
 
     @abc.abstractmethod
     def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
-        """Forget everything and begin with this pose: x, y (m) and, where there is one, heading (rad)."""
+        """Restart with this pose: x, y (m) and heading (rad) if there is one."""
 
     @abc.abstractmethod
     def take(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
-        """Correct the estimate by a pose that is newer than the last one."""
+        """Update the estimate with a pose that is newer than the last one."""
 
     @abc.abstractmethod
     def at(self, time: float) -> Float[np.ndarray, "d"]:
-        """Where the robot should be at a time (s): x, y, heading; at `stamp` for a time before that."""
+        """The extrapolated x, y (m), heading (rad) at a time (s); for a time before `stamp`, those at
+        `stamp`."""
 
 
 @final
 class EvaderTrack(Track):
-    """The robot itself, whose commands are known: between poses it is where they took it.
+    """The evader, whose commands are known: between poses it is extrapolated with them.
 
-    Position and heading have a variance each, which grows by (`drift` dt)^2 + (0.1 `drift`)^2 dt between
-    poses, the motors following only to within `drift` (m/s). A command u acts `delay` (s) after it was given,
-    and then v' = (u - v) / `motor_lag` (s), but no faster than `acceleration` (m/s^2).
+    Position and heading have one variance each. It grows by (`drift` dt)^2 + (0.1 `drift`)^2 dt between
+    poses, where `drift` (m/s) is the velocity error of the motors. A command u acts after `delay` (s); then
+    v' = (u - v) / `motor_lag` (s), with |v'| at most `acceleration` (m/s^2).
     """
 
     def __init__(
@@ -74,34 +74,35 @@ class EvaderTrack(Track):
         self._velocity = np.zeros(2)
 
     def told(self, time: float, velocity: Float[np.ndarray, "2"]) -> None:
-        """A command (m/s, world axes) was given at `time` (s). Commands of later times, which a clock left
-        that went back, are forgotten."""
+        """Register a command (m/s, world axes) given at `time` (s). Commands of later times, which exist
+        after a clock went back, are forgotten."""
         acts = time + self._delay
         while self._commands and self._commands[-1][0] > acts:
             self._commands.pop()
         self._commands.append((acts, np.array(velocity, float)))
-        # What acted before the last pose is in it.
+        # Commands before the last pose are already part of it.
         known = -math.inf if self.stamp is None else self.stamp
         while len(self._commands) > 1 and self._commands[1][0] <= known:
             self._commands.popleft()
 
     def _driven(self, begin: float, end: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """The way (m) between two times, and the velocity (m/s) at its end."""
+        """The displacement (m) between two times, and the velocity (m/s) at the end."""
         way, velocity = np.zeros(2), self._velocity
-        for i, (since, wanted) in enumerate(self._commands):
+        for i, (since, command) in enumerate(self._commands):
             until = self._commands[i + 1][0] if i + 1 < len(self._commands) else math.inf
             duration = min(until, end) - max(since, begin)
             if duration > 0.0:
-                step, velocity = self._follow(velocity, wanted, duration)
+                step, velocity = self._follow(velocity, command, duration)
                 way += step
         return way, velocity
 
     def _follow(
-        self, velocity: Float[np.ndarray, "2"], wanted: Float[np.ndarray, "2"], duration: float
+        self, velocity: Float[np.ndarray, "2"], command: Float[np.ndarray, "2"], duration: float
     ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """At the limit first, as far as the lag alone would be faster; then exponentially. Exact, because
-        the velocity goes straight to the wanted one."""
-        lacking = wanted - velocity
+        """Displacement (m) and velocity (m/s) after `duration` (s): first with the largest acceleration,
+        while the lag alone would exceed it, then exponentially. Exact, because the velocity changes along a
+        line."""
+        lacking = command - velocity
         size, way = math.hypot(*lacking), np.zeros(2)
         hard = size / self._acceleration - self._motor_lag if math.isfinite(self._acceleration) else 0.0
         if hard > 0.0:
@@ -110,7 +111,7 @@ class EvaderTrack(Track):
             way = (velocity + 0.5 * gained) * hard
             velocity, lacking, duration = velocity + gained, lacking - gained, duration - hard
         closed = -math.expm1(-duration / self._motor_lag) if self._motor_lag > 0.0 else float(duration > 0.0)
-        way = way + wanted * duration - lacking * self._motor_lag * closed
+        way = way + command * duration - lacking * self._motor_lag * closed
         return way, velocity + closed * lacking
 
     def start(self, stamp: float, pose: Float[np.ndarray, "d"]) -> None:
@@ -143,16 +144,16 @@ class EvaderTrack(Track):
         return moved
 
     def velocity_at(self, time: float) -> Float[np.ndarray, "2"]:
-        """How fast (m/s) it drives at a time (s) at or after `stamp`."""
+        """The velocity (m/s) at a time (s) not before `stamp`."""
         return np.full(2, np.nan) if self.stamp is None else self._driven(self.stamp, time)[1]
 
 
 @final
 class PursuerTrack(Track):
-    """A differential drive of unknown commands: an extended Kalman filter on (x, y, heading, v, omega).
+    """A differential drive with unknown commands: an extended Kalman filter on (x, y, heading, v, omega).
 
-    Between poses it drives on at v and omega, which may change by V and V/b within about 0.25 s; they are
-    kept to what the wheels can do, |v| + b |omega| <= V.
+    Between poses v and omega are constant, with process noise as if they changed by V and V/b within about
+    `_REACTION`; they are limited to |v| + b |omega| <= V.
     """
 
     def __init__(self, position_noise: float, heading_noise: float, rim_speed: float, half_axle: float):
@@ -190,7 +191,7 @@ class PursuerTrack(Track):
         self._state, self.stamp = state, stamp
 
     def _moved(self, elapsed: float) -> Float[np.ndarray, "5"]:
-        """On the arc, its chord pointing along the heading half-way."""
+        """The state after `elapsed` (s) on an arc; its chord points along the mean heading."""
         x, y, heading, speed, rate = self._state
         half = 0.5 * rate * elapsed
         chord = speed * elapsed * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
@@ -209,7 +210,7 @@ class PursuerTrack(Track):
         slope[1, 2], slope[1, 3], slope[1, 4] = way * cosine, elapsed * sine, 0.5 * way * elapsed * cosine
         slope[2, 4] = elapsed
         noise = np.zeros((5, 5))
-        # White acceleration along the heading, and in turning.
+        # White noise in the acceleration along the heading and in the turn rate's derivative.
         along = np.array([cosine * elapsed / 2.0, sine * elapsed / 2.0, 0.0, 1.0, 0.0])
         around = np.array([0.0, 0.0, elapsed / 2.0, 0.0, 1.0])
         noise += self._change[0] * elapsed * np.outer(along, along)
@@ -229,9 +230,9 @@ class PursuerTrack(Track):
 
 @final
 class ObstacleTrack(Track):
-    """A drifting obstacle: constant velocity but for a white acceleration, so that its drift is found.
+    """An obstacle: constant velocity with white noise in the acceleration.
 
-    `likely_speed` (m/s) is how fast obstacles tend to be, before this one was seen to move.
+    `likely_speed` (m/s) is the standard deviation of its velocity before any motion is observed.
     """
 
     def __init__(self, position_noise: float, likely_speed: float, acceleration: float):
