@@ -64,7 +64,7 @@ def test_training_whose_networks_break_stops_and_keeps_the_last_good_checkpoint(
     assert read_summary(folder)["episodes"] == int(state.episodes)
     assert not (folder / "policy.npz").exists()
     # It resumes, and says the same; nothing is lost by that.
-    with pytest.raises(Diverged, match="come to the same end"):
+    with pytest.raises(Diverged, match="diverge again"):
         small.train(options=options, out=folder, resume=True)
     again, _ = read_checkpoint(folder, example)
     assert small.differences(again, state) == []

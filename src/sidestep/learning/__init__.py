@@ -1,4 +1,4 @@
-"""What the evader learns: TD3, replay, the training loop, checkpoints, the policy it leaves."""
+"""Learning: TD3, replay, the training loop, checkpoints, the trained policy."""
 
 from sidestep.learning.divergence import Diverged
 from sidestep.learning.networks import Actor

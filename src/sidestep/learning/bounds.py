@@ -1,4 +1,4 @@
-"""From the actions that a policy asks for to those that the robot drives, for a whole batch at once."""
+"""Map a batch of proposed actions to the actions that the robot executes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from sidestep.world.robots import limit_speed
 
 
 def on_disc(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
-    """Actions as the robot executes them: norm cut to one (`to_velocity` does the same to the policy's)."""
+    """Clip the norm of actions to 1, as `to_velocity` does with the policy's action."""
     return jax.vmap(limit_speed, in_axes=(0, None))(actions, real(1.0))
 
 
 def through_shield(scenario: Scenario, shield: Any, worlds: World) -> Bound:
-    """Actions as the shield lets them through, each in its own world of `worlds` (a leading batch axis).
+    """Filter each action with the shield, in its world of `worlds` (leading batch axis).
 
-    The derivative of the answer with respect to the action comes with it: the identity where the shield
-    lets the action pass, along a row where it is projected on that row, and 0 where it is held in a corner
-    of two rows, or of a row and the speed limit; never NaN.
+    The derivative with respect to the action is the identity where the shield accepts the action, the
+    projection along a row where the action is projected on that row, and 0 in a corner of two rows, or of a
+    row and the speed limit; never NaN.
 
-    It is the first control period of a decision that is filtered, with the memory of an episode that begins
-    there. Where shield `joint` looks ahead, `shield.rows_only` stands in for it: an imagined chase for each
-    world of each batch would cost far more than the training, and carries no derivatives.
+    This filters the first control period of a decision, with the memory of an episode that begins there. The
+    look-ahead of the shield `joint` is replaced by `shield.rows_only`: it would cost far more than the
+    training, and has no derivatives.
     """
     filtered_by = getattr(shield, "rows_only", shield)
 

@@ -14,7 +14,7 @@ from sidestep.store.files import append_bytes, make_folder
 
 
 def _protos() -> Any:
-    # Imported where it is needed: by trainings only, and it takes a while.
+    # A slow import, which only trainings need.
     from tensorboardX.proto import event_pb2
 
     return event_pb2
@@ -23,15 +23,15 @@ def _protos() -> Any:
 class Curves:
     """Scalars over episodes: return, steps, clearances, interventions, losses.
 
-    Written here, one chunk at a time, and not by tensorboardX's `SummaryWriter`: an interrupt while that one
-    hands an event to its thread can leave its `close` waiting for ever.
+    Does not use tensorboardX's `SummaryWriter`: an interrupt while that passes an event to its thread can
+    make its `close` wait forever.
     """
 
     def __init__(self, folder: str | Path, purge_step: int):
         event = _protos()
         place = Path(folder) / "curves"
         make_folder(place)
-        # Files are named by the second; the count keeps a resume within it from overwriting what is there.
+        # The time in a file's name is in s; the count keeps a resume within that second from overwriting.
         count = len(list(place.glob("events.out.tfevents.*")))
         self._path = place / f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{count:06d}"
         start = event.SessionLog(status=event.SessionLog.START)
@@ -44,8 +44,8 @@ class Curves:
         )
 
     def write(self, lines: list[dict[str, Any]], losses: Any) -> None:
-        """Add the episodes of a chunk, and the means of its `losses` (critic, actor, value) at its last
-        episode."""
+        """Add the episodes of a chunk, and the means of its `losses` (critic, actor, value) at the last of
+        them."""
         from tensorboardX.summary import scalar
 
         entries: list[tuple[str, float, int]] = []
@@ -72,5 +72,5 @@ class Curves:
             length = struct.pack("<Q", len(data))
             for part in (length, data):
                 records += [part, struct.pack("<I", masked_crc32c(part))]
-        # Unbuffered and at once: a chunk is in the file or not, whatever interrupts.
+        # One unbuffered write: after an interrupt the chunk is in the file or not.
         append_bytes(self._path, b"".join(records))

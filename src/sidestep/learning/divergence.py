@@ -1,4 +1,4 @@
-"""Has a training come apart, and where? Networks, losses and actions must stay finite numbers."""
+"""Detect divergence of a training: networks, losses and actions must stay finite."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _USUAL_SCALE = 0.01
 
 
 class Diverged(ValueError):
-    """A training that cannot go on, because something in it is no longer a finite number.
+    """A training stopped because a number in it is not finite.
 
-    **Arguments:** `found` as `divergence` returns it; `options` of the training; `done` episodes that the
-    last good state has seen, and the `checkpoint` that holds it, None for a training without a folder.
+    **Arguments:** `found` as `divergence` returns it; `options` of the training; `done` episodes of the last
+    finite state, and its `checkpoint`, None for a training without a folder.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Diverged(ValueError):
         if checkpoint is not None:
             kept = (
                 f" The last state that was finite, after {done} episodes, is in {checkpoint}; with "
-                "--resume it would go on from there with the same options and come to the same end."
+                "--resume the training would continue from there and diverge again."
             )
         super().__init__(
             f"training stopped in episode {episode}: {what} not finite. The usual causes are learning rates "
@@ -75,7 +75,7 @@ def _finite_parts(learner: Learner) -> Bool[Array, "parts"]:
 
 
 def broken_networks(learner: Learner) -> list[str]:
-    """What of a learner is not finite, in words; nothing if all is well."""
+    """The parts of a learner that are not finite, in words; empty if all are finite."""
     return [
         words
         for words, good in zip(_PARTS.values(), np.asarray(_finite_parts(learner)), strict=True)
@@ -84,7 +84,7 @@ def broken_networks(learner: Learner) -> list[str]:
 
 
 def check_networks(learner: Learner, folder: Path) -> None:
-    """**Raises** `CheckpointError` where the networks that `folder` holds are not finite."""
+    """**Raises** `CheckpointError` if the learner, restored from `folder`, is not finite."""
     if broken := broken_networks(learner):
         raise CheckpointError(
             f"the newest checkpoint in {folder} cannot be trained on: the {', '.join(broken)} are not "
@@ -93,7 +93,7 @@ def check_networks(learner: Learner, folder: Path) -> None:
 
 
 def divergence(report: Report, learner: Learner, done: int) -> tuple[int, str] | None:
-    """The episode (from 1) in which something was first not finite, and what; None if all is well.
+    """The first episode (from 1) with a non-finite value, and what it was; None if all are finite.
 
     **Arguments:** `report` of a chunk of decisions, `learner` at its end, `done` episodes before it.
     """

@@ -1,4 +1,4 @@
-"""Actor and critics: two hidden layers of ReLU, as TD3's authors use them."""
+"""Actor and critics: perceptrons with two hidden ReLU layers, as in TD3."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from sidestep._arrays import AnyArray, real
 
 
 class Perceptron(eqx.Module):
-    """Fully connected ReLU network on a batch, its rows the samples.
+    """Fully connected ReLU network for a batch, one sample per row.
 
-    Weights are stored (inputs, outputs) so that a batch is one matrix product. They start uniform in
-    +-1/sqrt(inputs), the PyTorch default that TD3's reference uses; the last layer is scaled by
-    `last_scale`.
+    Weights have shape (inputs, outputs). They are initialised uniformly in +-1/sqrt(inputs), the PyTorch
+    default in TD3's reference; the last layer is scaled by `last_scale`.
     """
 
     weights: list[Float[Array, "inputs outputs"]]
@@ -83,5 +82,5 @@ class TwinCritic(eqx.Module):
     def first_value(
         self, observations: Float[AnyArray, "batch observation"], actions: Float[AnyArray, "batch action"]
     ) -> Float[Array, "batch"]:
-        """Q1 alone, which is what TD3's actor climbs."""
+        """Q1 alone, which TD3's actor maximises."""
         return self.first(jnp.concatenate([observations, actions], axis=-1))[:, 0]

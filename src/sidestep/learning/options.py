@@ -1,4 +1,4 @@
-"""What a training can be told, with the paper's printed values as defaults where it prints them."""
+"""Options of a training. Defaults are the paper's values where it prints them."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from sidestep.learning.td3 import TD3
 class TrainingOptions(eqx.Module):
     """Options of the training loop around `TD3`.
 
-    - `algorithm`: TD3's own hyper-parameters; its discount applies per decision.
+    - `algorithm`: the hyper-parameters of TD3; its discount applies per decision.
     - `decision_steps`: control periods between two decisions; the shield runs at each period.
     - `batch_size`, `updates_per_decision`, `warmup_decisions` (uniformly random before any update).
     - `exploration_noise`: standard deviation, in units of the action range.
-    - `hindsight`: share of each batch read with a place reached later as its target.
-    - `mirror`: share of each batch reflected left to right, which is the same problem seen in a mirror.
+    - `hindsight`: share of each batch whose target is replaced by a position reached later.
+    - `mirror`: share of each batch reflected left to right.
     - `reward_scale`: multiplies rewards inside the learner only; reported returns are the paper's.
-    - `bound_values`: cut target values at the reward for reaching, since no return can exceed it.
-    - `replay_action`: `"proposed"` (the policy's) or `"executed"` (the shield's answer; the target
-      action then passes through the shield too).
-    - `filter_gradients`: pass the actor's action through the shield as well before the critic judges it, so
-      that the actor climbs along the derivative of the executed action with respect to the proposed one.
-      For executed actions only: a critic of proposed ones has the shield inside it already, and would be
-      asked about an action filtered twice.
-    - `correction_penalty`: reward taken off per decision in which the shield corrected by v_e throughout, in
-      the units of the paper's reward. It is a price on what was proposed; a critic of executed actions
-      sees it only as a price on the actions that corrections end in.
-    - `replay_capacity`: transitions kept; never more than the training can produce.
+    - `bound_values`: limit target values to the reward for reaching, since no return can exceed it.
+    - `replay_action`: `"proposed"` (the policy's action) or `"executed"` (the shield's; the target action is
+      then filtered, too).
+    - `filter_gradients`: filter the actor's action with the shield before the critic evaluates it, so that
+      the actor's gradient contains the derivative of the executed action with respect to the proposed one.
+      Only for executed actions: a critic of proposed actions already models the shield, and the action would
+      be filtered twice.
+    - `correction_penalty`: subtracted from the reward of a decision whose mean correction is v_e, in
+      proportion to the correction, in units of the paper's reward. It penalises the proposed action; a critic
+      of executed actions attributes it to the executed one.
+    - `replay_capacity`: largest number of transitions kept; never more than the training can produce.
     """
 
     algorithm: TD3 = eqx.field(default_factory=TD3)
@@ -55,14 +55,14 @@ class TrainingOptions(eqx.Module):
         if self.filter_gradients and self.replay_action != "executed":
             raise ValueError(
                 f"training option 'filter_gradients' = True: it needs replay_action='executed', not "
-                f"{self.replay_action!r}, whose critic has the shield inside it already"
+                f"{self.replay_action!r}, whose critic already models the shield"
             )
 
 
 def make_options(**values: Any) -> TrainingOptions:
-    """Validated options from plain values, `TrainingOptions`' and `TD3`'s fields side by side.
+    """Validated options from the fields of `TrainingOptions` and of `TD3` by name.
 
-    `make_options(discount=0.98, updates_per_decision=3)`; what is not given keeps its default.
+    Example: `make_options(discount=0.98, updates_per_decision=3)`; other fields keep their defaults.
 
     **Raises** `ValueError` naming the option, its value and what is allowed.
     """
@@ -73,7 +73,7 @@ def make_options(**values: Any) -> TrainingOptions:
         if name not in rules:
             raise ValueError(f"unknown training option '{name}'{did_you_mean(name, rules)}")
         rule = rules[name]
-        # JSON from elsewhere writes 10 as 10.0.
+        # Some JSON writers write 10 as 10.0.
         whole = isinstance(rule, Bound) and rule.whole and isinstance(value, float) and value.is_integer()
         used[name] = taken(f"training option '{name}'", int(value) if whole else value, rule)
     if "hidden" in used:
@@ -83,7 +83,7 @@ def make_options(**values: Any) -> TrainingOptions:
 
 
 def options_to_dict(options: TrainingOptions) -> dict[str, Any]:
-    """All options as plain JSON values; `make_options` rebuilds them."""
+    """All options as JSON values, the arguments of `make_options`."""
     values: dict[str, Any] = {}
     for owner in (options.algorithm, options):
         for field in dataclasses.fields(owner):

@@ -1,4 +1,4 @@
-"""The policy that a training leaves behind."""
+"""The trained policy."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _FILE = "policy.npz"
 
 @final
 class LearnedPolicy(eqx.Module):
-    """A trained actor: observation to action in [-1, 1]^2, asked every `decision_steps` control periods."""
+    """A trained actor: observation to action in [-1, 1]^2, once every `decision_steps` control periods."""
 
     actor: Actor
     decision_steps: int = eqx.field(static=True)
 
     def __call__(self, observation: Float[AnyArray, "observation"]) -> Float[Array, "2"]:
-        """**Raises** `ValueError` when the observation has another length than the policy was trained on."""
+        """**Raises** `ValueError` if the observation's length differs from that of the training."""
         wanted = self.actor.body.weights[0].shape[0]
         if observation.shape != (wanted,):
             raise ValueError(
@@ -45,10 +45,10 @@ def write_policy(folder: str | Path, policy: LearnedPolicy) -> Path:
 
 
 def load_policy(run: str | Path) -> LearnedPolicy:
-    """The policy that a training left in its run folder, or in the `policy.npz` file given.
+    """Read the policy of a run folder, or of a `policy.npz` file.
 
-    **Raises** `RunError` when the folder holds no run or its training has not written a policy yet, and
-    `CheckpointError` when the file is damaged.
+    **Raises** `RunError` when the folder holds no run or its training has not ended, and `CheckpointError`
+    when the file is damaged.
     """
     path = Path(run)
     if path.suffix != ".npz":

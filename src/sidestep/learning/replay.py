@@ -1,4 +1,4 @@
-"""Replay of whole world transitions, from which batches are made for any target and either action."""
+"""Replay of world transitions. Batches can be sampled for any target and for proposed or executed actions."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sidestep.world.robots import closest_approach_straight
 
 
 class Transition(eqx.Module):
-    """One decision of the policy: the world before and after, and everything that happened between.
+    """One decision of the policy: the world before and after, and the motion between.
 
-    Nothing in it depends on the target, which moves nothing; so the same transition can be read with
-    any other target (hindsight, Andrychowicz et al., NeurIPS 2017) and its reward recomputed exactly.
+    The target has no effect on the motion. A transition is therefore valid for any other target (hindsight,
+    Andrychowicz et al., NeurIPS 2017), with an exactly recomputed reward.
 
-    **Attributes:** `path (n+1, 2)` the evader at every control instant of the decision (m; the last place
-    repeated once the episode has ended); `steps` control periods executed; `proposed (2,)` the velocity
-    the policy asked for and `executed (2,)` the mean velocity driven (m/s, world axes); `correction`
-    mean size of the shield's correction (m/s); `lost` whether capture or collision ended it.
+    **Attributes:** `path (n+1, 2)` the evader's positions (m) at the control instants, the last one repeated
+    after the episode's end; `steps` control periods executed; `proposed (2,)` velocity of the policy and
+    `executed (2,)` mean velocity (m/s, world axes); `correction` mean size of the shield's correction (m/s);
+    `lost` whether capture or collision ended it.
     """
 
     world: World
@@ -36,10 +36,10 @@ class Transition(eqx.Module):
 
 
 class Replay(eqx.Module):
-    """Ring of transitions. `written` counts all ever added; slot = count modulo capacity.
+    """Ring buffer of transitions. `written` counts all transitions so far; slot = count modulo capacity.
 
-    `episode` says which episode a slot belongs to, `episode_last[e mod len]` the count of that
-    episode's newest transition, so that a later place of the same episode is one look-up away.
+    `episode` is the episode of each slot, and `episode_last[e mod len]` the count of the newest transition of
+    episode e, so that a later transition of the same episode is found by one look-up.
     """
 
     transitions: Transition
@@ -69,8 +69,8 @@ class Replay(eqx.Module):
     def add(self, transition: Transition, episode: Int[Array, ""], active: Flag) -> Replay:
         """The ring with one more transition of episode number `episode`; unchanged unless `active`.
 
-        The write is unconditional and merely lands out of bounds when inactive: a conditional would copy
-        the whole ring under `vmap`.
+        An inactive write goes out of bounds and is dropped: a conditional would copy the whole ring under
+        `vmap`.
         """
         slot = jnp.where(active, self.written % self.capacity, self.capacity)
         last_slot = jnp.where(active, episode % self.capacity, self.capacity)
@@ -87,10 +87,10 @@ class Replay(eqx.Module):
 def reward_along(
     scenario: Scenario, transition: Transition, target: Float[Array, "2"]
 ) -> tuple[Scalar, Bool[Array, ""]]:
-    """Sum of the paper's reward over a decision for any target, and whether the episode ends in it.
+    """Sum of the paper's reward over a decision for the given target (m), and whether the episode terminates.
 
-    The evader moves straight between control instants, so the swept distance to the target is exact.
-    Returns (reward, terminated); lost episodes end without the bonus in their last period.
+    The evader moves straight between control instants, so the least distance to the target is exact. In its
+    last period a lost episode gets no bonus for reaching the target.
     """
     knots = transition.path
     count = knots.shape[0] - 1
@@ -114,10 +114,10 @@ def _reflect(vectors: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
 
 
 def mirror_world(world: World, model: EvaderModel | None = None) -> World:
-    """The world reflected in its x axis: left and right swap, headings change sign; `model` mirrors what it
-    keeps of the evader, or else that stays as it is.
+    """The world reflected at its x axis: left and right swap, headings change sign. `model` mirrors the
+    evader's state; without a model it is unchanged.
 
-    The robots do not tell left from right, so a transition's mirror image is as true as itself.
+    The robots' motion is symmetric, so the mirror image of a transition is a valid transition.
     """
     state = world.evader_state
     mirrored = None if model is None or state is None else model.mirrored(state)
@@ -152,17 +152,18 @@ def sample(
     correction_penalty: Float[Array, ""],
     reward_scale: Float[Array, ""],
 ) -> tuple[Batch, World, World]:
-    """A batch of uniform transitions, a share `hindsight` of them with a place reached later as target.
+    """A batch of uniformly sampled transitions, a share `hindsight` of them with a position reached later as
+    target.
 
-    The later place is uniform over the rest of the same episode (the "future" strategy). The action is
-    the proposed or the executed velocity in the policy's axes *for that target*; the reward is scaled by
-    `reward_scale` after `correction_penalty` times the mean correction (as a share of v_e) is taken off.
+    The later position is uniform over the rest of the same episode (the "future" strategy). The action is the
+    proposed or the executed velocity in the policy's axes *for that target*. The reward is `reward_scale`
+    times the sum less `correction_penalty` times the mean correction (as a share of v_e).
 
-    **Returns** the batch, and the worlds before and after its actions: with the sampled targets, and mirrored
-    where the batch is, so that whatever is computed in them (a shield's answer, say) belongs to its rows.
+    **Returns** the batch, and the worlds before and after its actions, with the sampled targets and mirrored
+    like the batch, so that a shield can be evaluated in them.
     """
     index_key, later_key, choice_key, knot_key, mirror_key = jax.random.split(key, 5)
-    # Slots count back from the newest, so that sampling is uniform over what the ring still holds.
+    # Slots count back from the newest, so that sampling is uniform over the stored transitions.
     back = jax.random.randint(index_key, (batch_size,), 1, replay.size + 1)
     count = replay.written - back
     slot = count % replay.capacity
@@ -172,7 +173,7 @@ def sample(
     span = (last - count + 1).astype(reward_scale.dtype)
     ahead = jnp.floor(jax.random.uniform(later_key, (batch_size,), dtype=float) * span).astype(count.dtype)
     later = (jnp.minimum(count + ahead, last)) % replay.capacity
-    # Any control instant of the later decision will do; the last one is always valid.
+    # A random control instant of the later decision; the last one is always valid.
     knots = replay.transitions.path[later]
     places = jnp.take_along_axis(
         knots,

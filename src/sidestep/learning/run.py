@@ -1,4 +1,4 @@
-"""A training from the outside: run folder, progress, checkpoints, interruption and resume."""
+"""Run a training: run folder, progress, checkpoints, interruption and resume."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ from sidestep.store.files import OutputError, json_safe, write_json
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
 CHUNK = 100
-"""Decisions per compiled call: about half a second of work, so progress and Ctrl-C feel immediate."""
+"""Decisions per compiled call: about 0.5 s, so that progress and Ctrl-C respond quickly."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training is. `last` is the newest episode's line of `metrics.jsonl`, if one has ended."""
+    """The progress of a training. `last` is the newest episode's line of `metrics.jsonl`, if one has
+    ended."""
 
     episode: int
     episodes: int
@@ -47,9 +48,9 @@ class Progress:
 
 @dataclass(frozen=True)
 class Training:
-    """What a training gave: policy, `summary.json`, one entry per episode, and the state it ended in.
+    """The result of a training: policy, `summary.json`, one entry per episode, and the final state.
 
-    `had_ended`: it was resumed, but there was nothing left to do.
+    `had_ended`: the training was resumed but had already ended.
     """
 
     policy: LearnedPolicy
@@ -100,13 +101,13 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
 
 
 def resume_settings(folder: str | Path) -> dict[str, Any]:
-    """What `train` needs to continue a run as it was begun: scenario, shield, pursuer, seed and the like.
+    """The arguments with which `train` continues a run: scenario, shield, pursuer, seed and others.
 
     **Raises** `RunError` when `folder` holds no training.
     """
     config = records.open_run(folder, "run", otherwise=records.NOT_BEGUN)
     fields = dict(config["scenario"])
-    # The stored fields are complete, so whichever preset they start from leaves no trace.
+    # The stored fields are complete, so the preset has no effect.
     return {
         "scenario": load_scenario("paper", **fields),
         "shield": config["shield"],
@@ -132,35 +133,34 @@ def train(
     checkpoint_seconds: float = 20.0,
     chunk: int = CHUNK,
 ) -> Training:
-    """Train a policy with TD3 while the shield keeps the evader safe.
+    """Train a policy with TD3 behind a shield.
 
     With `out` the run is a folder: `config.json`, `metrics.jsonl`, checkpoints, TensorBoard curves, and at
-    the end `summary.json` and `policy.npz`. The same seed gives the same run on the same machine, whether
-    or not it was interrupted and resumed in between. `KeyboardInterrupt` stops it cleanly at the next
-    chunk, with a checkpoint to resume from.
+    the end `summary.json` and `policy.npz`. The same seed gives the same run on the same machine, with or
+    without interruption and resume. `KeyboardInterrupt` stops the training after the current chunk and writes
+    a checkpoint.
 
-    **Arguments:** `shield` and `pursuer` names or objects; `resume` continues the run in `out`, whose
-    scenario, shield, pursuer, seed and options must be the ones given (`resume_settings` reads them) while
-    `episodes` may be larger; `progress` is called after every chunk of `chunk` decisions.
+    **Arguments:** `shield` and `pursuer` names or objects; `resume` continues the run in `out`, with the
+    stored scenario, shield, pursuer, seed and options (`resume_settings` reads them), while `episodes` may be
+    larger; `progress` is called after every chunk of `chunk` decisions.
 
-    The folder is held until the last file is written. A run that has its episodes already is left as it is.
-    A damaged checkpoint is passed over with a `DamageWarning`.
+    The folder is locked until the last file is written. A run that has all its episodes is not changed. A
+    damaged checkpoint is skipped with a `DamageWarning`.
 
-    **Raises** `ValueError` for a bad argument, `RunError` when `out` already holds something and `resume` is
-    not set, holds nothing to resume, or was begun with other settings; `FolderInUseError` when someone else
-    writes there; `OutputError` when the run cannot be written any more, and `Diverged` when networks, losses
-    or actions are no longer finite. Then the newest checkpoint from before that stays, and the run can be
-    resumed from it.
+    **Raises** `ValueError` for an invalid argument; `RunError` when `out` is occupied and `resume` is not
+    set, has nothing to resume, or has other settings; `FolderInUseError` when another process writes there;
+    `OutputError` when the run cannot be written any more; `Diverged` when networks, losses or actions are not
+    finite. After the last two the newest checkpoint is kept, and the run can be resumed from it.
     """
     whole_number("episodes", episodes), whole_number("chunk", chunk), seed_number(seed)
     options = make_options() if options is None else options
-    guard, hunter = as_shield(shield, scenario), as_pursuer(pursuer)
+    names = {"shield": _name(shield), "pursuer": _name(pursuer)}
+    shield, pursuer = as_shield(shield, scenario), as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)
     config = {
         "scenario": scenario_to_dict(scenario),
         "learner": options_to_dict(options),
-        "shield": _name(shield),
-        "pursuer": _name(pursuer),
+        **names,
         "seed": int(seed),
         "episodes": int(episodes),
         "version": __version__,
@@ -168,15 +168,15 @@ def train(
     folder = None if out is None else Path(out)
     with nullcontext() if folder is None else records.writing(folder, resume=resume):
         return _run(
-            scenario, guard, hunter, options, capacity, config, folder, resume, progress, checkpoint_seconds,
-            chunk,
+            scenario, shield, pursuer, options, capacity, config, folder, resume, progress,
+            checkpoint_seconds, chunk,
         )  # fmt: skip
 
 
 def _run(
     scenario: Scenario,
-    guard: Any,
-    hunter: Any,
+    shield: Any,
+    pursuer: Any,
     options: TrainingOptions,
     capacity: int,
     config: dict[str, Any],
@@ -186,13 +186,13 @@ def _run(
     checkpoint_seconds: float,
     chunk: int,
 ) -> Training:
-    """The training itself, its folder held."""
+    """The training, with its folder locked."""
     episodes = int(config["episodes"])
     if folder is not None and resume:
         _check_same_run(folder, config)
     elif folder is not None:
         records.create_run(folder, config)
-    state = start(scenario, guard, options, jax.random.key(config["seed"]), capacity)
+    state = start(scenario, shield, options, jax.random.key(config["seed"]), capacity)
     metrics: list[dict[str, Any]] = []
     earlier = 0.0
     if folder is not None and resume:
@@ -218,12 +218,12 @@ def _run(
         while int(state.episodes) < episodes:
             _interrupts.check()
             chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
-            reached, report = run_chunk(scenario, guard, hunter, options, state, limit, chunk)
+            reached, report = run_chunk(scenario, shield, pursuer, options, state, limit, chunk)
             diverged = divergence(report, reached.learner, len(metrics))
             if diverged is not None:
                 break
             lines = _episode_lines(report, len(metrics))
-            # One statement, so that an interrupt finds state and metrics of the same moment.
+            # One statement, so that state and metrics are consistent at an interrupt.
             state, metrics = reached, metrics + lines
             now = time.perf_counter()
             chunk_seconds.append((int(state.env_steps) - steps_before, now - chunk_begun))
@@ -234,7 +234,7 @@ def _run(
                     write_checkpoint(folder, state, wall_seconds=earlier + now - begun)
                     saved = now
             if progress is not None:
-                # The first chunk compiles; it tells the rate only while there is no other.
+                # The first chunk compiles; its rate is used only until the second has ended.
                 recent = chunk_seconds[1:][-20:] or chunk_seconds
                 steps, seconds = (sum(column) for column in zip(*recent, strict=True))
                 progress(_progress(metrics, state, episodes, steps / seconds))
@@ -242,7 +242,7 @@ def _run(
         interrupted = True
     except BaseException as error:
         if folder is not None:
-            # What went wrong first is said.
+            # Report the first error.
             with suppress(OutputError):
                 _keep(folder, metrics, state, earlier + time.perf_counter() - begun, summary())
             if isinstance(error, OutputError):
@@ -266,7 +266,7 @@ def _run(
 def _keep(
     folder: Path, metrics: list[dict[str, Any]], state: TrainState, seconds: float, figures: dict[str, Any]
 ) -> Path:
-    """Bring the run's files up to this state; its checkpoint."""
+    """Write the run's files for this state; returns the checkpoint's path."""
     records.append_metrics(folder, metrics[len(records.read_metrics(folder)) :])
     checkpoint = write_checkpoint(folder, state, wall_seconds=seconds)
     records.write_summary(folder, figures)
@@ -274,7 +274,7 @@ def _keep(
 
 
 def _kept(folder: Path) -> str:
-    """What a run that could not go on can be resumed from."""
+    """A message that names the checkpoint from which a stopped run can be resumed."""
     kept = list_checkpoints(folder)
     if not kept:
         return f"Nothing of the training is kept in {folder} yet"
@@ -282,7 +282,7 @@ def _kept(folder: Path) -> str:
 
 
 def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
-    """**Raises** `RunError` naming what differs from the run that `folder` holds."""
+    """**Raises** `RunError` naming the settings that differ from the run in `folder`."""
     stored = records.open_run(folder, "run", otherwise=records.NOT_BEGUN)
     records.refuse_changes(folder, stored, config, ("scenario", "learner", "shield", "pursuer", "seed"))
     if config["episodes"] < stored["episodes"]:
@@ -293,9 +293,9 @@ def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tuple[TrainState, float]:
-    """The state to continue from, the run's files cut back to it."""
+    """The state to continue from; truncates the run's files to it."""
     if not list_checkpoints(folder) and not records.read_metrics(folder):
-        # Killed before its first checkpoint: it resumes at its start, which another kill must find too.
+        # Killed before its first checkpoint: it resumes at the start, and so must it after another kill.
         state, wall_seconds = example, 0.0
         write_checkpoint(folder, state, wall_seconds=wall_seconds)
     else:
@@ -311,7 +311,7 @@ def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tup
 def _ended_before(
     folder: Path, state: TrainState, metrics: list[dict[str, Any]], episodes: int
 ) -> Training | None:
-    """What a run that has its episodes and all its files already gave; None if anything is left to do."""
+    """The result of a run that has all its episodes and files; None if anything is left to do."""
     try:
         policy, summary = load_policy(folder), records.read_summary(folder)
     except records.RunError:

@@ -1,8 +1,8 @@
-"""TD3, exactly: Fujimoto, van Hoof, Meger, "Addressing Function Approximation Error in Actor-Critic
-Methods", ICML 2018, and the authors' code where the two differ.
+"""TD3: Fujimoto, van Hoof, Meger, "Addressing Function Approximation Error in Actor-Critic Methods",
+ICML 2018, and the authors' code where the two differ.
 
-One `update` is one step of the algorithm on one batch; what fills the batch, and what an action means,
-is the training loop's business.
+One `update` is one step of the algorithm on one batch. The training loop fills the batch and defines the
+meaning of an action.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Bound = Callable[[Float[Array, "batch action"], PRNGKeyArray], Float[Array, "bat
 
 
 class TD3(eqx.Module):
-    """Hyper-parameters. Real values are traced, so seeds may be `vmap`-ped over learning rates.
+    """Hyper-parameters. Real values are traced, so `vmap` over learning rates is possible.
 
-    Noises are in units of the action range [-1, 1]. `policy_delay` counts critic updates per update of
-    the actor and of both target networks. `last_layer_scale` starts the actor near zero action (the
-    reference starts it at 1); everything else is the reference's.
+    Noises are in units of the action range [-1, 1]. `policy_delay` is the number of critic updates per update
+    of the actor and of both target networks. `last_layer_scale` initialises the actor near zero action (it is
+    1 in the reference); all else is as in the reference.
     """
 
     actor_learning_rate: Scalar = eqx.field(converter=real, default=3e-4, metadata=within(least=0.0))
@@ -42,7 +42,7 @@ class TD3(eqx.Module):
     last_layer_scale: float = static_field(0.01, least=0.0)
 
     def init(self, observations: int, actions: int, key: PRNGKeyArray) -> Learner:
-        """Fresh networks; targets start equal to them."""
+        """New networks, with equal target networks."""
         actor_key, critic_key = jax.random.split(key)
         actor = Actor(observations, actions, self.hidden, actor_key, self.last_layer_scale)
         critic = TwinCritic(observations, actions, self.hidden, critic_key)
@@ -59,7 +59,7 @@ class TD3(eqx.Module):
 
 
 class Learner(eqx.Module):
-    """Everything that TD3 changes: networks, targets, Adam moments, count of updates."""
+    """The state of TD3: networks, target networks, Adam moments, count of updates."""
 
     actor: Actor
     critic: TwinCritic
@@ -71,7 +71,7 @@ class Learner(eqx.Module):
 
 
 class Batch(eqx.Module):
-    """Transitions to learn from. `terminated` is 1 where the value beyond is zero; time limits are not."""
+    """Transitions to learn from. `terminated` is 1 where the next value is zero, and 0 at time limits."""
 
     observation: Float[Array, "batch observation"]
     action: Float[Array, "batch action"]
@@ -81,7 +81,7 @@ class Batch(eqx.Module):
 
 
 class Losses(eqx.Module):
-    """Diagnostics of one update; `actor` is 0 in the updates that leave the actor alone."""
+    """Diagnostics of one update; `actor` is 0 in updates that do not change the actor."""
 
     critic: Scalar
     actor: Scalar
@@ -94,7 +94,7 @@ def _no_bound(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float
 
 def _adam(gradients, moments, network, rate: Scalar):
     """One Adam step with a traced learning rate."""
-    # Optax raises floats to integer powers, which strict promotion forbids.
+    # Optax raises floats to integer powers, which strict dtype promotion forbids.
     with jax.numpy_dtype_promotion("standard"):
         directions, moments = optax.scale_by_adam().update(gradients, moments)
     return jax.tree.map(lambda weight, direction: weight - rate * direction, network, directions), moments
@@ -103,7 +103,7 @@ def _adam(gradients, moments, network, rate: Scalar):
 def actor_loss(
     actor: Actor, critic: TwinCritic, observation: Float[Array, "batch observation"], bound: Bound, key: Any
 ) -> Scalar:
-    """-mean Q1(s, bound(pi(s))): what the actor descends."""
+    """The actor's loss, -mean Q1(s, bound(pi(s)))."""
     return -jnp.mean(critic.first_value(observation, bound(actor(observation), key)))
 
 
@@ -119,13 +119,13 @@ def update(
     """One TD3 update.
 
     y = r + discount (1 - terminated) min_i Q_i'(s', a'),  a' = clip(pi'(s') + clip(noise)), and the critic
-    loss is the *sum* of the two mean squared errors. Every `policy_delay` updates the actor climbs Q1
-    and both target networks move.
+    loss is the *sum* of the two mean squared errors. Every `policy_delay` updates the actor's loss is
+    descended and both target networks are updated.
 
-    `bound` maps actions onto those the robot can execute (a disc, say) before any critic judges them, and
-    the actor's gradient goes through it; `target_bound` does so for the target action alone (the safety
-    filter in the worlds after, when executed actions are learned from) and is `bound` unless given.
-    `value_limit`, when given, is the largest value there can be: y is cut to it.
+    `bound` maps actions to those the robot can execute (such as a disc) before a critic evaluates them; the
+    actor's gradient passes through it. `target_bound` does so for the target action (the shield in the next
+    worlds, when learning from executed actions); by default it is `bound`. `value_limit` is an upper bound of
+    y.
     """
     noise_key, bound_key, actor_key = jax.random.split(key, 3)
     target_bound = bound if target_bound is None else target_bound

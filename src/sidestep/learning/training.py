@@ -1,4 +1,4 @@
-"""The training loop: act, shield, move, store, update, all on the device under one `lax.scan`."""
+"""The training loop on the device, under one `lax.scan`: act, filter, move, store, update."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sidestep.world import Scenario, observation_size, observe
 
 
 class TrainState(eqx.Module):
-    """Everything a training is: save it and the training goes on bit for bit."""
+    """The complete state of a training: a training restored from it continues bitwise equal."""
 
     learner: Learner
     replay: Replay
@@ -32,8 +32,8 @@ class TrainState(eqx.Module):
 
 
 class Report(eqx.Module):
-    """What one decision reports to the host: the tally, which is an episode's when `ended`; whether the
-    action asked for was `finite`."""
+    """The host's data of one decision: the tally, which is the episode's total when `ended`; whether the
+    proposed action was `finite`."""
 
     ended: Bool[Array, "..."]
     outcome: Int[Array, "..."]
@@ -44,8 +44,8 @@ class Report(eqx.Module):
 
 
 class _Drive(NamedTuple):
-    """One decision: the episode after it, the sums of the actions executed and of their corrections (m/s),
-    and the evader's `path`."""
+    """One decision: the episode after it, the sums of the executed actions and of the corrections (m/s), and
+    the evader's `path`."""
 
     end: Episode
     executed: Float[Array, "2"]
@@ -59,8 +59,8 @@ def start(
 ) -> TrainState:
     """The state before the first decision.
 
-    Its types are exactly those that `run_chunk` returns: a weakly typed count, say, would make the second
-    chunk compile anew.
+    Its dtypes equal those that `run_chunk` returns. A weakly typed count, for example, would make the second
+    chunk recompile.
     """
     net_key, reset_key, key = jax.random.split(key, 3)
     world = scenario.reset(reset_key)
@@ -140,8 +140,7 @@ def decide_and_learn(
 ) -> tuple[TrainState, Report]:
     """One decision of the policy, its control periods, and the updates that follow it.
 
-    Once `limit` episodes have ended nothing changes any more, so a training stops exactly at the end of
-    an episode wherever its chunks end.
+    After `limit` episodes the state does not change, so a training stops exactly at the end of an episode.
     """
     active = state.episodes < limit
     world, task = state.episode.world, Task(scenario, None, shield, pursuer)
@@ -190,7 +189,7 @@ def decide_and_learn(
         decisions=state.decisions + 1,
         env_steps=env_steps,
     )
-    # Replay and learner were gated where they change; selecting the rest costs nothing.
+    # Replay and learner are conditional where they change; selecting the rest is cheap.
     heavy = lambda s: (s.learner, s.replay)  # noqa: E731
     frozen = eqx.tree_at(heavy, state, (learner, replay))
     state = eqx.tree_at(
