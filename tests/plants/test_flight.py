@@ -247,7 +247,7 @@ def test_airframes_that_cannot_fly_are_named(scene):
         Airframe(mass=0.1)
     with pytest.raises(ValueError, match="mass = -1"):
         Airframe(mass=-1.0)
-    with pytest.raises(TwinError, match=r"leans \d+ degrees, more than largest_tilt = 20"):
+    with pytest.raises(TwinError, match=r"tilts \d+ degrees, more than largest_tilt = 20"):
         Flight(scene, FlightOptions(gains=Gains(largest_tilt=math.radians(20.0))))
     weak = load_scenario("quadrotor-test", evader_model=Quadrotor(0.11, 0.025))
     with pytest.raises(TwinError, match="longer time_constant"):
@@ -259,7 +259,7 @@ def test_scenarios_without_a_quadrotor_are_refused(scene):
         Pilot(load_scenario("paper-test"))
     with pytest.raises(TwinError, match="differential drive after a quadrotor"):
         Pilot(load_scenario("quadrotor-test", pursuer_model=None, pursuer_half_axle=0.2))
-    with pytest.raises(ValueError, match="needs one that guards its control point"):
+    with pytest.raises(ValueError, match="needs a shield of its control point"):
         Pilot(scene, shield=make_shield("none", load_scenario("paper-test")))
 
 

@@ -1,4 +1,4 @@
-"""In which physics? One interface for the plain simulation, robots on the ground and in the air; one loop."""
+"""Plants: one interface for the simulation, ground robots and a quadrotor in MuJoCo, and one host loop."""
 
 from sidestep.plants.contacts import Contacts, Watch
 from sidestep.plants.plant import Plant

@@ -1,4 +1,4 @@
-"""What do the plants in MuJoCo have in common: time in steps, sensors, least distances, frames."""
+"""What the plants in MuJoCo share: time steps, sensors, least distances, frames."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ _FRAME_RATE = 100.0
 
 @dataclass(frozen=True)
 class Look:
-    """How a video shows a plant: `height` (m) at which the robots fly, 0 on the ground; `post` (m) of the
-    target; `trail` height and width (m); `tall` (m) what stands on the floor; `tilt` (rad) of the camera;
-    pursuers farther than `near` (m) from the evader may be out of the picture."""
+    """How a video shows a plant.
+
+    `height` (m) at which the robots fly, 0 on the ground; `post`, height (m) of the target's post; `trail`,
+    height and width (m) of trails; `tall`, height (m) of the obstacles; `tilt` (rad) of the camera; pursuers
+    farther than `near` (m) from the evader may be out of the picture.
+    """
 
     height: float = 0.0
     post: float = 0.16
@@ -36,8 +39,8 @@ class Look:
 class Bodies(Plant):
     """Bodies in MuJoCo. A concrete plant places them in `_begin` and moves them in `advance`.
 
-    **Attributes:** `model` and `data` of MuJoCo; `counts` of pursuers and obstacles; `options`; `look` in a
-    video; `frames` at 100 Hz since the reset, and `frame_times` in s.
+    **Attributes:** `model` and `data` of MuJoCo; `counts` of pursuers and obstacles; `options`; `look` for
+    videos; `frames` at 100 Hz since the reset, and `frame_times` in s.
 
     **Raises** `TwinError` when MuJoCo is missing.
     """
@@ -68,7 +71,7 @@ class Bodies(Plant):
 
     @abc.abstractmethod
     def _begin(self, world: World, root: np.random.Generator) -> None:
-        """Place everything, and let the sensors watch the start."""
+        """Place all bodies, and let the sensors sample the start."""
 
     @property
     def time(self) -> float:
@@ -80,29 +83,29 @@ class Bodies(Plant):
         return self._watch.least
 
     def _limited(self, velocity: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """A commanded velocity (m/s) cut to the evader's speed; zero if it is not finite."""
-        wanted = np.asarray(velocity, float)
-        wanted = wanted if np.all(np.isfinite(wanted)) else np.zeros(2)
-        speed = math.hypot(*wanted)
-        return wanted * (self._speed / speed) if speed > self._speed else wanted
+        """A commanded velocity (m/s) limited to the evader's speed; zero if it is not finite."""
+        command = np.asarray(velocity, float)
+        command = command if np.all(np.isfinite(command)) else np.zeros(2)
+        speed = math.hypot(*command)
+        return command * (self._speed / speed) if speed > self._speed else command
 
     def _steps_in(self, duration: float) -> int:
         """Whole physics steps until `duration` (s) from now."""
         return round((self.time + duration) / self.options.physics_step) - self._steps
 
     def _record(self) -> None:
-        """Keep a frame, if one is due at this step."""
+        """Store a frame if one is due at this step."""
         if self._steps % self._every == 0:
             self.frames.append(self._frame())
             self.frame_times.append(self.time)
 
     @abc.abstractmethod
     def _frame(self) -> Any:
-        """The bodies as they are now, for `show`."""
+        """The current state of the bodies, for `show`."""
 
     @abc.abstractmethod
     def show(self, frame: Any) -> None:
-        """Put the bodies as they were in one of the frames, to be drawn."""
+        """Set the bodies' state to one of the frames, to draw it."""
 
     @abc.abstractmethod
     def places_of(self, frames: Any) -> Float[np.ndarray, "n robots 2"]:

@@ -1,4 +1,4 @@
-"""How near did the evader come to whom, along a stretch of time?"""
+"""The evader's least distances over an interval of time."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from sidestep.world import Scenario
 
 @dataclass(frozen=True)
 class Contacts:
-    """What one stretch of time brought, from the true positions at every physics step.
+    """Least distances (m) between centres over an interval, from the true positions at every physics step.
 
-    `pursuer_distance` and `obstacle_distance` are the least distances (m) between centres, infinite without
-    such a robot; `target_distance` (m) the least one to the target.
+    `pursuer_distance` and `obstacle_distance` are infinite without such a robot; `target_distance`.
     """
 
     pursuer_distance: float
@@ -30,7 +29,7 @@ class Contacts:
 
 @final
 class Watch:
-    """Looks at every physics step and keeps the least distances (m) to a pursuer and to an obstacle."""
+    """Tracks the least distances (m) to a pursuer and to an obstacle over all physics steps."""
 
     def __init__(self, scenario: Scenario, target: Float[np.ndarray, "2"]):
         self._pursuers, self._target = scenario.pursuer_count, target
@@ -41,7 +40,7 @@ class Watch:
         self.least = (math.inf, math.inf)
 
     def see(self, poses: Float[np.ndarray, "n robots 3"]) -> Contacts:
-        """The contacts along these poses, evader first, then pursuers, then obstacles."""
+        """The contacts along these poses; order: evader, pursuers, obstacles."""
         evader, m = poses[:, 0, :2], self._pursuers
         apart = np.linalg.norm(poses[:, 1:, :2] - evader[:, None], axis=-1)
         pursuer, obstacle = (float(np.min(group, initial=math.inf)) for group in (apart[:, :m], apart[:, m:]))

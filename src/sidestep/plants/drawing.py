@@ -1,4 +1,4 @@
-"""What is drawn beside the bodies, and from where one looks."""
+"""Shapes drawn in addition to the bodies, and the camera."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def rgba(colour: str, alpha: float = 1.0) -> Float[np.ndarray, "4"]:
 
 
 def mjcf_colour(colour: str, alpha: float = 1.0) -> str:
-    """A colour `#rrggbb` as MJCF wants it."""
+    """A colour `#rrggbb` in MJCF notation."""
     return " ".join(f"{channel:.4f}" for channel in rgba(colour, alpha))
 
 
 def studio(*, shadows: int, view: str, tiles: int) -> str:
-    """Light, sky and the material of a tiled floor as MJCF: `shadows` across in pixels, attributes of how it
-    is `view`ed, `tiles` to a metre."""
+    """Light, sky and the material of a tiled floor as MJCF: `shadows`, size of the shadow map in pixels;
+    `view`, attributes of MJCF's `map`; `tiles` per metre."""
     return f"""\
   <visual>
     <global offwidth="1920" offheight="1200"/>
@@ -45,7 +45,7 @@ def studio(*, shadows: int, view: str, tiles: int) -> str:
 
 @final
 class Decor:
-    """Draws what is not a body: distances, paths, the target."""
+    """Draws shapes that are not bodies: distances, paths, the target."""
 
     def __init__(self, mujoco: Any, scene: Any):
         self._mujoco, self._scene = mujoco, scene
@@ -92,7 +92,7 @@ class Decor:
 
 
 def thinned(path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """A path with points about a centimetre apart."""
+    """The path with points about 1 cm apart."""
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))])
     kept = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], _TRAIL_STEP)))
     return path[np.append(kept, len(path) - 1)]
@@ -108,10 +108,10 @@ def camera_over(
     tall: float = 0.15,
     tilt: float = math.radians(-52.0),
 ) -> Any:
-    """Looks down slantwise from the side of negative y, from as near as shows everything.
+    """A camera that looks down from the side of negative y, as near as it can be to show all points.
 
-    **Arguments:** `points` (m) to be seen with `margin` (m) around them; `field` of view from top to bottom
-    (rad); `aspect` width over height; `tall` (m) what stands there; `tilt` (rad) of the view.
+    **Arguments:** `points` (m) to show, with `margin` (m) around them; vertical `field` of view (rad);
+    `aspect`, width over height; `tall`, height (m) of the bodies; `tilt` (rad) of the view.
     """
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     middle = np.array([*(low + high) / 2.0, 0.0])

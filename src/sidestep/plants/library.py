@@ -1,4 +1,4 @@
-"""Where do MuJoCo and off-screen rendering come from, and what is missing when they do not?"""
+"""Import MuJoCo and off-screen rendering, and say what to install if they are missing."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _LIBRARIES = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.s
 
 
 class TwinError(ValueError):
-    """The twin cannot run as asked; the message says what to install or to change."""
+    """A plant in MuJoCo cannot run; the message says what to install or change."""
 
 
 def check_robots(world: Any, pursuers: int, obstacles: int) -> None:
-    """**Raises** `TwinError` for a world with other numbers of robots than the scenario's."""
+    """**Raises** `TwinError` if the world's numbers of robots differ from the scenario's."""
     if (len(world.pursuers), len(world.obstacles)) != (pursuers, obstacles):
         raise TwinError(
             f"the world has {len(world.pursuers)} pursuers and {len(world.obstacles)} obstacles, "
@@ -66,7 +66,7 @@ def make_renderer(model: Any, height: int, width: int, most_shapes: int) -> Any:
     mujoco = load_mujoco()
     try:
         return mujoco.Renderer(model, height, width, most_shapes)
-    # What is missing shows as whatever the OpenGL binding in use raises.
+    # The OpenGL bindings raise various exceptions when something is missing.
     except Exception as error:
         backend = os.environ.get("MUJOCO_GL", "the default one")
         raise TwinError(

@@ -1,4 +1,4 @@
-"""What does the loop ask of a plant, whatever moves in it?"""
+"""The interface of a plant."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sidestep.world import Scenario, World
 
 
 class Plant(abc.ABC):
-    """A world that moves as it is commanded and is known by measurements.
+    """A world that executes commands and returns measurements.
 
-    `reset` it, then `command`, `advance` and read `measurements`, in the rhythm of whoever decides; `play`
-    does so once per control period. The same seed and the same commands give the same episode.
+    Call `reset`, then repeatedly `command`, `advance` and `measurements`; `play` does so once per control
+    period. The same seed and commands give the same episode.
 
-    **Attributes:** `scenario`; `pose_rate` Hz, sets of measurements per second; `tracking_error` how far the
-    evader is from its command, in a unit that the plant says; `frames` to be drawn, and `frame_times` (s).
+    **Attributes:** `scenario`; `pose_rate` Hz, measurements of each robot per second; `tracking_error`, the
+    evader's deviation from its command, in the plant's unit; `frames` to draw, and `frame_times` (s).
     """
 
     scenario: Scenario
@@ -32,9 +32,9 @@ class Plant(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, world: World, seed: int | None = None) -> None:
-        """Put everything where `world` has it, at time 0; `seed` of the noise, as before if not given.
+        """Start in `world` at time 0. `seed` is that of the noise; by default the previous one.
 
-        **Raises** `TwinError` for a world with other numbers of robots than the scenario's.
+        **Raises** `TwinError` if the world's numbers of robots differ from the scenario's.
         """
 
     @abc.abstractmethod
@@ -43,17 +43,17 @@ class Plant(abc.ABC):
     ) -> None:
         """Command the evader (m/s, world axes) and the pursuers (rim speeds, m/s) until the next command.
 
-        What is beyond a limit is cut to it; what is not finite counts as a stop. `turn_rate` (rad/s) is for
-        an evader that may turn.
+        Commands are limited; one that is not finite counts as a stop. `turn_rate` (rad/s) is for an evader
+        that can turn.
         """
 
     @abc.abstractmethod
     def advance(self, duration: float) -> Contacts:
-        """Let `duration` (s) pass; returns how near the evader came to what."""
+        """Simulate `duration` (s); returns the evader's least distances."""
 
     @abc.abstractmethod
     def measurements(self) -> list[Measurement]:
-        """The poses that have arrived since the last call; of each robot the oldest first."""
+        """The poses that have arrived since the last call; per robot, oldest first."""
 
     @property
     @abc.abstractmethod

@@ -1,4 +1,4 @@
-"""How does an episode go on a plant? See, decide, command, advance, once per control period."""
+"""An episode on a plant: measure, decide, command, advance, once per control period."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ class Robot(abc.ABC):
 
     @abc.abstractmethod
     def reset(self) -> None:
-        """Forget the episode before."""
+        """Reset the state before an episode."""
 
     @abc.abstractmethod
     def decide(self, plant: Any) -> Decision:
-        """The decision for the period that begins now, from what has been measured by now."""
+        """The decision for the period that begins now, from the measurements so far."""
 
 
 def see(onboard: Onboard, plant: Plant) -> None:
-    """Hand the plant's new measurements to a decision core."""
+    """Pass the plant's new measurements to a decision core."""
     for robot, index, stamp, pose in plant.measurements():
         onboard.see(robot, stamp, pose if robot != "obstacle" else pose[:2], index)
 
 
 @final
 class _Core(Robot):
-    """A decision core with a policy, which goes to the target of the start."""
+    """A decision core with a policy; its target is that of the start world."""
 
     def __init__(self, onboard: Onboard):
         self._onboard = onboard
@@ -63,14 +63,14 @@ class _Core(Robot):
 
 @eqx.filter_jit
 def start_of(scenario: Scenario, seed: Array) -> tuple[World, PRNGKeyArray]:
-    """The start that `rollout` has with this seed, and the key of its pursuers."""
+    """The start world of `rollout` with this seed, and the random key of its pursuers."""
     start_key, pursuit_key = start_and_pursuit(jax.random.key(seed))
     return scenario.reset(start_key), pursuit_key
 
 
 @eqx.filter_jit
 def steered(scenario: Scenario, pursuer: Pursuer, world: World, key: PRNGKeyArray, period: Array) -> Array:
-    """What every pursuer does in a period, (m, 2) m/s."""
+    """Rim speeds (m, 2) in m/s of every pursuer in a period."""
     return pursue(scenario, pursuer, world, jax.random.fold_in(key, period))
 
 
@@ -84,15 +84,15 @@ def play(
     world: World | None = None,
     pursuer_sees: str = "truth",
 ) -> PlantEpisode:
-    """One episode: measurements, the robot's command and the pursuers', the plant, once per control period.
+    """One episode on a plant: measure, decide, command and advance once per control period.
 
-    Start, measurements and random pursuers follow from `seed`; the start is that of `rollout` with this seed.
+    `seed` determines the start (that of `rollout`), the measurements and random pursuers.
 
-    **Arguments:** `robot` a decision core with a policy, or a `Robot`; it is reset, as the plant is.
-    `pursuer` as for `evaluate`; `steps` at most this many control periods (the scenario's `episode_steps` if
-    not given); `world` to start in; `pursuer_sees`, see `PURSUER_SEES`.
+    **Arguments:** `robot` a decision core with a policy, or a `Robot`; robot and plant are reset. `pursuer`
+    as for `evaluate`; `steps` the largest number of control periods (default: the scenario's
+    `episode_steps`); `world` to start in; `pursuer_sees`, see `PURSUER_SEES`.
 
-    **Raises** `ValueError` as `evaluate`, and as the plant.
+    **Raises** `ValueError` as `evaluate` and as the plant.
     """
     scenario = plant.scenario
     taken("pursuer_sees", pursuer_sees, SEEN, TwinError)

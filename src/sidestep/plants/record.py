@@ -1,4 +1,4 @@
-"""What is kept of an episode on a plant?"""
+"""The record of an episode on a plant."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from sidestep.world import Events, Scenario, World
 class PlantEpisode:
     """One episode of T control periods.
 
-    - `trajectory` its truth as a `Trajectory`: worlds at the beginning of each period, the decisions, and
-      events from the least distances at every instant
+    - `trajectory`: true worlds at the beginning of each period, the decisions, and events from the least
+      distances over each period
     - `least_pursuer_distance`, `least_obstacle_distance` (m) over the episode, infinite without such a robot
-    - `levels` per period, and `reactions` as pairs of a time (s) and what the decision core said it did
-    - `estimate_errors (T,)` m, the largest error of a robot's estimated place as seen from the evader;
+    - `levels` per period, and `reactions` of the decision core as pairs of time (s) and text
+    - `estimate_errors (T,)` m, the largest error of a robot's estimated position relative to the evader;
       `tracking_errors (T,)`, the plant's `tracking_error` at the end of each period
-    - `compute_seconds (T,)` what each decision took
+    - `compute_seconds (T,)` of each decision
     - `frames` of the plant, for `write_video`, and `frame_times` s
     """
 
@@ -48,7 +48,7 @@ class PlantEpisode:
 
     @property
     def outcome(self) -> str:
-        """`captured`, `collided`, `reached`, `timed_out`, or `cut` when it was stopped before."""
+        """`captured`, `collided`, `reached`, `timed_out`, or `cut` if stopped early."""
         return self.trajectory.outcome
 
     @property
@@ -57,7 +57,7 @@ class PlantEpisode:
         return self.trajectory.length * float(self.scenario.control_period)
 
     def to_dict(self) -> dict[str, Any]:
-        """Its figures as plain values; None for the distance to robots that there are none of."""
+        """The numbers as JSON values; None for a distance without such a robot."""
         status = np.asarray(self.trajectory.status)
         return {
             "seed": self.seed,
@@ -82,7 +82,7 @@ def _finite(distance: float) -> float | None:
 
 
 def events_of(scenario: Scenario, world: World, contacts: Contacts, last: bool) -> dict[str, Any]:
-    """What a period brought, in the terms of the plain simulation."""
+    """The `Events` fields of a period."""
     distance = float(np.hypot(*(np.asarray(world.evader) - np.asarray(world.target))))
     cost = -float(scenario.distance_cost) * distance
     over = last and not (contacts.captured or contacts.collided or contacts.reached)
@@ -103,7 +103,7 @@ def _seen_from_evader(world: World) -> Float[np.ndarray, "n 2"]:
 
 
 def estimate_error(decision: Decision, truth: World) -> float:
-    """How far (m) the place of any robot, seen from the evader, was from where the decision took it to be."""
+    """Largest error (m) of the decision's estimate of a robot's position relative to the evader."""
     if decision.world is None:
         return 0.0
     error = np.linalg.norm(_seen_from_evader(decision.world) - _seen_from_evader(truth), axis=-1)
@@ -112,7 +112,7 @@ def estimate_error(decision: Decision, truth: World) -> float:
 
 @final
 class Log:
-    """Writes an episode down, period by period; `world` is the truth at the end of the last."""
+    """Records an episode period by period; `world` is the true world after the last period."""
 
     def __init__(self, plant: Plant):
         self._plant, self.world = plant, plant.world
@@ -124,7 +124,7 @@ class Log:
     def add(
         self, now: float, decision: Decision, wheels: Float[np.ndarray, "m 2"], contacts: Contacts
     ) -> bool:
-        """Write down one period, begun at `now` (s); returns whether the episode ended in it."""
+        """Record one period, begun at `now` (s); returns whether the episode ended in it."""
         plant, before = self._plant, self.world
         self.world = plant.world
         self._worlds.append(self.world)
@@ -149,9 +149,9 @@ class Log:
         return any(self._events[-1][name] for name in OUTCOMES)
 
     def episode(self, seed: int) -> PlantEpisode:
-        """All that was written down."""
+        """The recorded episode."""
         stacked = lambda trees: jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)  # noqa: E731
-        # On the host first, or JAX would compile a stack of every new length.
+        # Stack on the host: JAX would compile a program for every new length.
         worlds = stacked([jax.tree.map(np.asarray, world) for world in self._worlds])
         pursuer, obstacle, estimates, tracking, seconds = np.array(self._numbers).T
         return PlantEpisode(

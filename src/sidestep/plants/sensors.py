@@ -1,4 +1,4 @@
-"""What is measured of a robot's pose, how wrong is it, and when does it arrive?"""
+"""Pose sensors: rate, noise, delay and drop-outs."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from sidestep._bounds import DISTANCE, bounded, check, did_you_mean
 from sidestep.plants.library import TwinError
 
 _CUT = 3.0
-"""Noise is cut at this many standard deviations, so that every error has a bound."""
+"""Noise is truncated at this many standard deviations, so that every error is bounded."""
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """How poses are measured; the same for every robot, each with errors of its own.
+    """How poses are measured. The parameters hold for every robot; the errors are independent.
 
-    - `rate` Hz; `synchronised`: one sample falls on every control instant, otherwise the phase is drawn
-    - `position_noise` m and `heading_noise` rad: standard deviations, per axis, of errors independent from
-      sample to sample, cut at three of them (a position's in its length)
-    - `position_bias` m and `heading_bias` rad: size of a constant error whose direction is drawn
-    - `position_drift` m/sqrt(s) and `heading_drift` rad/sqrt(s): random walk, per axis, without bound
-    - `delay` s from the sample to its arrival; `dropout` the share of samples that never arrive
+    - `rate` Hz; `synchronised`: samples coincide with the control instants, otherwise the phase is random
+    - `position_noise` m and `heading_noise` rad: standard deviations, per axis, of independent errors,
+      truncated at three standard deviations (for positions the length of the error)
+    - `position_bias` m and `heading_bias` rad: size of a constant error of random direction
+    - `position_drift` m/sqrt(s) and `heading_drift` rad/sqrt(s): unbounded random walk, per axis
+    - `delay` s from a sample to its arrival; `dropout`, the share of samples that never arrive
     """
 
     rate: float = bounded(100.0, least=0.1, most=1e4, unit="Hz")
@@ -46,14 +46,14 @@ class Sensors:
         check(self, title="sensors: ", error=TwinError)
 
     def numbers(self) -> dict[str, float]:
-        """Every figure by name."""
+        """All numbers by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if name != "synchronised"}
 
     def bounds(self) -> dict[str, float]:
-        """The largest errors, as `sidestep.safety.certify` asks for them; drift and drop-outs left out.
+        """Error bounds as arguments of `sidestep.safety.certify`, without drift and drop-outs.
 
-        `position_error` m of the pursuer as seen from the evader, each measured with an error of its own;
-        `heading_error` rad of the pursuer; `delay` s, the greatest age of the newest sample.
+        `position_error` m of the pursuer relative to the evader, the sum of both robots' errors;
+        `heading_error` rad of the pursuer; `delay` s, the largest age of the newest sample.
         """
         wait = 0.0 if self.synchronised else 1.0 / self.rate
         return {
@@ -94,7 +94,7 @@ def changed_sensors(sensors: Sensors, changes: Mapping[str, Any]) -> Sensors:
     for field in changes:
         if field not in known:
             hint = did_you_mean(field, known)
-            raise TwinError(f"unknown field '{field}' of the sensors{hint} Known: {', '.join(known)}")
+            raise TwinError(f"unknown sensor field '{field}'{hint} Known: {', '.join(known)}")
     check(Sensors, changes, title="sensors: ", error=TwinError)
     return dataclasses.replace(sensors, **changes)
 
@@ -103,7 +103,7 @@ _SEEN_BEFORE = 0.5
 
 
 class Measurement(NamedTuple):
-    """A pose (x, y in m, heading in rad) as measured, with the time (s) at which it was true; `robot` is
+    """A measured pose (x, y in m, heading in rad) with the time stamp (s) of its sample; `robot` is
     `evader`, `pursuer` or `obstacle`."""
 
     robot: str
@@ -114,10 +114,10 @@ class Measurement(NamedTuple):
 
 @final
 class PoseSensor:
-    """Measures one robot. Samples fall on multiples of `step` (s), the step of the physics.
+    """Measures one robot. Samples fall on multiples of `step` (s), the physics step.
 
-    All its random numbers come from `generator`, in the order of the samples: how the time in between is cut
-    into pieces changes nothing.
+    Random numbers come from `generator` in the order of the samples, so they do not depend on how the time is
+    split into calls.
     """
 
     def __init__(
@@ -146,13 +146,13 @@ class PoseSensor:
 
     def _step_of(self, sample: int) -> int:
         """The physics step at whose end a sample is taken."""
-        # Rounded up, but not by what a sum of floats is off.
+        # Rounded up, with a tolerance for floating-point error.
         return math.ceil((self._phase + sample / self._sensors.rate) / self._step - 1e-6)
 
     def watch(self, first: int, poses: Float[np.ndarray, "n 3"]) -> None:
         """Take the samples that fall on the physics steps `first`, `first` + 1, ..., with these true poses.
 
-        The steps of one call follow on those of the call before.
+        Each call continues at the step after the previous call's last.
         """
         if self._taken is None:
             self._taken = math.floor(first * self._step * self._sensors.rate) - 1
@@ -178,7 +178,7 @@ class PoseSensor:
         self._under_way.append((arrival, Measurement(self._robot, self._index, stamp, seen)))
 
     def arrived(self, now: float) -> list[Measurement]:
-        """What has arrived by `now` (s) and was not handed out before, oldest first."""
+        """Measurements that have arrived by `now` (s) and were not returned before, oldest first."""
         handed_out = []
         while self._under_way and self._under_way[0][0] <= now + 1e-9:
             handed_out.append(self._under_way.popleft()[1])
@@ -187,10 +187,10 @@ class PoseSensor:
 
 @final
 class PoseSensors:
-    """A sensor for every robot: the evader's first, then the pursuers', then the obstacles'.
+    """A sensor for every robot; order: evader, pursuers, obstacles.
 
-    Each has random numbers of its own, spawned from `root`, so that what one measures does not hang on
-    another. `counts` are those of pursuers and obstacles.
+    Each has a random generator spawned from `root`, so the sensors are independent. `counts` are the numbers
+    of pursuers and obstacles.
     """
 
     def __init__(self, sensors: Sensors, counts: tuple[int, int], step: float, root: np.random.Generator):
@@ -205,8 +205,8 @@ class PoseSensors:
     def watch_the_start(
         self, poses: Float[np.ndarray, "robots 3"], velocities: Float[np.ndarray, "robots 2"]
     ) -> None:
-        """They have been on for a while when the clock starts: what they saw arrives at once. Until then the
-        robots came to these poses straight on, at these velocities (m/s)."""
+        """Sample the time before the episode, in which robots moved to these poses at constant velocities
+        (m/s)."""
         settings = self._settings
         before = math.ceil((_SEEN_BEFORE + settings.delay + 1.0 / settings.rate) / self._step)
         ages = self._step * np.arange(-before, 1)
@@ -220,13 +220,14 @@ class PoseSensors:
             sensor.watch(first, poses[:, robot])
 
     def arrived(self, now: float) -> list[Measurement]:
-        """What has arrived by `now` (s) and was not handed out before; per robot, oldest first."""
+        """Measurements that have arrived by `now` (s) and were not returned before; per robot, oldest
+        first."""
         return [one for sensor in self._each for one in sensor.arrived(now)]
 
     def evaders(self, now: float) -> list[Measurement]:
-        """The same of the evader alone."""
+        """`arrived` of the evader."""
         return self._each[0].arrived(now)
 
     def others(self, now: float) -> list[Measurement]:
-        """The same of all but the evader."""
+        """`arrived` of all robots except the evader."""
         return [one for sensor in self._each[1:] for one in sensor.arrived(now)]

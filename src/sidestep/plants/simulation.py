@@ -1,4 +1,4 @@
-"""What is it like without motors and noise? The plain simulation as a plant."""
+"""The simulation as a plant, without motors and noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sidestep.world.robots import closest_approach_straight
 def _step(
     scenario: Scenario, world: World, velocity: Array, wheels: Array, duration: Array, time: Array
 ) -> tuple[World, Events, Array]:
-    """`Scenario.step` over `duration` (s), which ends at `time` (s), and how near the target was (m)."""
+    """`Scenario.step` over `duration` (s), ending at `time` (s), and the least distance (m) to the target."""
     held = eqx.tree_at(lambda scenario: scenario.control_period, scenario, duration)
     moved, events = held.step(world, velocity, wheels)
     chord, once = moved.evader - world.evader, jnp.ones_like(duration)
@@ -33,9 +33,10 @@ def _step(
 
 @final
 class Simulation(Plant):
-    """`Scenario.step` as a plant: exact motion over any stretch of time, and exact poses of this instant.
+    """`Scenario.step` as a plant: exact motion over any duration, and exact current poses.
 
-    **Arguments:** `heading` (rad) of the evader at the start; it turns as commanded, which moves nothing.
+    **Arguments:** `heading` (rad) of the evader at the start. It follows the turn rate and has no effect on
+    the motion.
     """
 
     def __init__(self, scenario: Scenario, heading: float = 0.0):
@@ -46,7 +47,7 @@ class Simulation(Plant):
         check_robots(world, self.scenario.pursuer_count, self.scenario.obstacle_count)
         self._world, self._time, self._heading = world, 0.0, self._first_heading
         self.command(np.zeros(2), np.zeros((len(world.pursuers), 2)))
-        # Compiled now, not in the loop.
+        # Compile here, not in the loop.
         self._moved(float(self.scenario.control_period))
 
     def command(
@@ -72,7 +73,7 @@ class Simulation(Plant):
         )
 
     def measurements(self) -> list[Measurement]:
-        """The poses of this instant, at every call."""
+        """The current poses, at every call."""
         world = self._world
         groups = {
             "evader": [(*world.evader, self._heading)],

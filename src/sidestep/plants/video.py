@@ -1,4 +1,4 @@
-"""What does an episode on robots look like? Frames and a video, rendered without a screen."""
+"""Frames and videos of an episode in MuJoCo, rendered off-screen."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def frames_of(
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The scene at these times (s), rendered off-screen; `size` is height and width in pixels.
 
-    Circles are the capture distance around each pursuer, the collision distance around each obstacle and the
-    distance that counts as reached around the target; lines are the ways taken so far.
+    Circles show the capture distance around each pursuer, the collision distance around each obstacle and the
+    reach distance around the target; lines are the paths so far.
 
     **Arguments:** `episode` a `TwinEpisode` or a `FlightEpisode`.
 
@@ -75,11 +75,11 @@ def write_video(
     speed: float = 1.0,
     size: tuple[int, int] = _SIZE,
 ) -> Path:
-    """Write an episode as a video of `rate` frames per second, `speed` times as fast as it was: .mp4 (H.264),
-    .gif or .webp.
+    """Write an episode as a video of `rate` frames per second, `speed` times real time: .mp4 (H.264), .gif or
+    .webp.
 
-    It ends with one second of the last frame. **Arguments:** as for `frames_of`. **Raises** `TwinError` when
-    off-screen rendering, or for .mp4 PyAV, is missing, and as `write_video_file`.
+    The last frame is shown for 1 s. **Arguments:** as for `frames_of`. **Raises** `TwinError` when off-screen
+    rendering, or PyAV for .mp4, is missing, and as `write_video_file`.
     """
     if Path(path).suffix.lower() == ".mp4":
         load_av()

@@ -1,4 +1,4 @@
-"""How would it go in the air? A quadrotor and its autopilot in a physics simulator, hunted by an aircraft."""
+"""A quadrotor with its autopilot in MuJoCo, pursued by an aircraft."""
 
 from sidestep.plants.air.airframe import Airframe
 from sidestep.plants.air.autopilot import Attitude, Autopilot, Gains, Setpoint

@@ -1,9 +1,9 @@
-"""What do the quadrotor, the aircraft that hunts it and the columns look like to the physics?
+"""MuJoCo models of the quadrotor, the pursuing aircraft and the columns.
 
-The quadrotor is of the size of a Crazyflie 2: mass, inertia and the ratio of a propeller's torque to its
-thrust are those measured by Förster, "System identification of the Crazyflie 2.0 nano quadrocopter" (ETH
-Zurich, 2015). Nothing touches anything: capture and collision are distances between centres in the plane, as
-in the scenario.
+The quadrotor has the size of a Crazyflie 2. Mass, inertia and the ratio of a propeller's torque to its thrust
+are those measured by Förster, "System identification of the Crazyflie 2.0 nano quadrocopter" (ETH Zurich,
+2015). There are no contacts: capture and collision are distances between centres in the plane, as in the
+scenario.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from sidestep.plants.drawing import mjcf_colour, studio
 from sidestep.world.flyers import GRAVITY
 
 ROTORS = ("front_left", "rear_left", "rear_right", "front_right")
-"""Clockwise, counter-clockwise and so on, seen from above."""
+"""Their directions of rotation alternate; the first is clockwise, seen from above."""
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """A quadrotor's numbers.
+    """The parameters of a quadrotor.
 
-    - `mass` kg; `inertia` kg m^2 about its axes; `arm` m, from the centre to a rotor
-    - `largest_thrust` N of one rotor; `rotor_torque` m, what a newton of thrust turns it back by; `rotor_lag`
-      s, the time constant of a rotor's thrust
-    - `drag` N s/m, what the rotors' blades oppose to motion
+    - `mass` kg; `inertia` kg m^2 about the body axes; `arm` m, from the centre to a rotor
+    - `largest_thrust` N of one rotor; `rotor_torque` m, drag torque per thrust; `rotor_lag` s, the time
+      constant of a rotor's thrust
+    - `drag` N s/m, the drag of the rotors' blades
     """
 
     mass: float = bounded(0.028, above=0.0, unit="kg")
@@ -53,7 +53,7 @@ class Airframe:
 
     @property
     def rotor_senses(self) -> tuple[float, ...]:
-        """Which way each rotor's drag turns the body: +1 counter-clockwise."""
+        """Sign of each rotor's drag torque on the body: +1 counter-clockwise."""
         return (1.0, -1.0, 1.0, -1.0)
 
 
@@ -86,7 +86,7 @@ def _rotor_motors(frame: Airframe) -> str:
 
 
 def _aircraft(index: int, colour: str) -> str:
-    """Wings, fuselage and tail; its capture disc is drawn, not modelled."""
+    """Wings, fuselage and tail. The capture disc is drawn only."""
     body, dark = mjcf_colour(colour), "0.15 0.15 0.15 1"
     return f"""
     <body name="pursuer{index}" mocap="true">

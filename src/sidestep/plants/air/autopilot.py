@@ -1,4 +1,4 @@
-"""How does a quadrotor fly the motion that it is asked for? A cascade, from position to rotors."""
+"""The quadrotor's autopilot: a cascade of controllers from position to rotor thrusts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Matrix = Float[np.ndarray, "3 3"]
 
 
 class Setpoint(NamedTuple):
-    """A motion to follow at this moment: m, m/s, m/s^2, m/s^3, world axes."""
+    """The reference motion now: m, m/s, m/s^2, m/s^3, world axes."""
 
     position: Vector
     velocity: Vector
@@ -27,7 +27,7 @@ class Setpoint(NamedTuple):
 
 
 class Attitude(NamedTuple):
-    """`rotation (3, 3)` from the body's axes to the world's, `rates (3,)` rad/s in the body's axes."""
+    """`rotation (3, 3)` from body axes to world axes, `rates (3,)` rad/s in body axes."""
 
     rotation: Matrix
     rates: Vector
@@ -35,14 +35,14 @@ class Attitude(NamedTuple):
 
 @dataclass(frozen=True)
 class Gains:
-    """Of the cascade, outermost loop first.
+    """Gains of the cascade, outermost loop first.
 
-    - `position` 1/s: velocity asked for per metre off
-    - `velocity` 1/s: acceleration per m/s off; `integral` 1/s^2 of the same, against drag and wind, at most
-      `integral_limit` m/s^2
-    - `attitude` 1/s^2 and `rates` 1/s: angular acceleration per rad and rad/s off, roll and pitch; a third of
-      the first, and the same of the second, in yaw
-    - `largest_tilt` rad: the thrust never leans over more
+    - `position` 1/s: velocity per position error
+    - `velocity` 1/s: acceleration per velocity error; `integral` 1/s^2 of that error, against drag and wind,
+      limited to `integral_limit` m/s^2
+    - `attitude` 1/s^2 and `rates` 1/s: angular acceleration per attitude error and per rate error in roll and
+      pitch; in yaw a third of the first, and the second
+    - `largest_tilt` rad: limit of the thrust's tilt
     """
 
     position: float = bounded(4.0, above=0.0, unit="1/s")
@@ -67,12 +67,12 @@ def _vee(matrix: Matrix) -> Vector:
 
 @final
 class Autopilot:
-    """Position and velocity loops ask for an acceleration, the thrust leans to give it, body rates follow,
-    and a mixer shares thrust and torques out among the rotors.
+    """Position and velocity loops command an acceleration, attitude and rate loops tilt the thrust to it, and
+    a mixer distributes thrust and torques to the rotors.
 
     The attitude law is that of Lee, Leok, McClamroch, "Geometric tracking control of a quadrotor UAV on
-    SE(3)", CDC 2010, with the rates that the setpoint's jerk asks for. Where the rotors cannot give all,
-    yaw is given up first, then the collective thrust shifts, so that the attitude is kept.
+    SE(3)", CDC 2010, with body rates from the setpoint's jerk. When rotors saturate, yaw torque is reduced
+    first, then the collective thrust is shifted, so that roll and pitch are kept.
     """
 
     def __init__(self, frame: Airframe, gains: Gains | None = None):
@@ -84,15 +84,15 @@ class Autopilot:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what the integral has gathered."""
+        """Reset the integral."""
         self._gathered = np.zeros(3)
         self.saturated = False
 
     def thrusts(
         self, wanted: Setpoint, position: Vector, velocity: Vector, attitude: Attitude, period: float
     ) -> Float[np.ndarray, "4"]:
-        """Thrust (N) of every rotor for the next `period` (s), from where the quadrotor thinks it is (m, m/s)
-        and how it is turned."""
+        """Thrust (N) of every rotor for the next `period` (s), to follow the setpoint `wanted` from the
+        estimated position (m), velocity (m/s) and attitude."""
         gains, frame = self.gains, self.frame
         off = wanted.velocity - velocity + gains.position * (wanted.position - position)
         limit = gains.integral_limit
@@ -105,11 +105,11 @@ class Autopilot:
             push[:2] *= most / aside
         size = math.sqrt(push @ push)
         up = push / size
-        # Heading 0: the body's y axis stays across the world's x.
+        # Heading 0: the body's y axis is perpendicular to the world's x axis.
         left = _cross(up, np.array([1.0, 0.0, 0.0]))
         left /= math.sqrt(left @ left)
         aim = np.stack([_cross(left, up), left, up], axis=1)
-        # How fast the wanted thrust direction turns, from the jerk; heading stays.
+        # Rotation rate of the desired thrust direction, from the jerk, at constant heading.
         leaning = (wanted.jerk - up * (up @ wanted.jerk)) / size
         turning = aim.T @ _cross(up, leaning)
         turning[2] = 0.0

@@ -1,4 +1,4 @@
-"""What happens in one flight, with the very decision core that a robot runs?"""
+"""One flight, with the decision core that a robot runs."""
 
 from __future__ import annotations
 
@@ -27,12 +27,11 @@ from sidestep.world.capture_geometry import to_pursuer_frame
 
 @dataclass(frozen=True)
 class FlightEpisode(PlantEpisode):
-    """One flight; `tracking_errors` are in m, how far the quadrotor was at most from the motion asked of it.
+    """One flight. `tracking_errors` (m) are the quadrotor's largest distances from its reference motion.
 
-    - `start_margin` m: how far outside the certificate's start set the flight began; None without a
-      certificate
-    - `saturated` s, for how long tilt or rotors were at their limits
-    - `frames` at 100 Hz: positions, and places and quaternions of the other bodies
+    - `start_margin` m, see `sidestep.safety.start_margin`; None without a certificate
+    - `saturated` s, time with tilt or rotors at their limits
+    - `frames` at 100 Hz: MuJoCo's positions, and positions and quaternions of the other bodies
     """
 
     options: FlightOptions
@@ -41,8 +40,8 @@ class FlightEpisode(PlantEpisode):
 
     @property
     def within_assumptions(self) -> bool:
-        """Whether all went as the certificate takes it to: a start outside its start set, no tracking error
-        above the one allowed for, no fault met by the decision core."""
+        """Whether the certificate's assumptions held: a start that it covers, no tracking error above the
+        assumed bound, no fault reported by the decision core."""
         return (
             (self.start_margin or 0.0) >= 0.0
             and float(np.max(self.tracking_errors)) <= self.options.tracking_error
@@ -50,11 +49,11 @@ class FlightEpisode(PlantEpisode):
         )
 
     def plant(self) -> Flight:
-        """The flight that it was, built anew."""
+        """A new plant like the one flown."""
         return Flight(self.scenario, self.options, self.seed)
 
     def to_dict(self) -> dict[str, Any]:
-        """As that of `PlantEpisode`, and what the certificate assumes."""
+        """As `PlantEpisode.to_dict`, with the certificate's assumptions."""
         return super().to_dict() | {
             "tracking_error_max": float(np.max(self.tracking_errors)),
             "within_assumptions": self.within_assumptions,
@@ -65,14 +64,14 @@ class FlightEpisode(PlantEpisode):
 
 @final
 class Pilot(Robot):
-    """Decides for the quadrotor: a policy's wish, through a shield that guards its control point.
+    """Decides for the quadrotor: filters the policy's nominal action by a shield of its control point.
 
-    The shield knows the quadrotor by the motion that its autopilot is asked for, and everybody else by
-    measured poses, which go through the decision core that robots run (`sidestep.robot.Onboard`).
-    Compiled once, it serves any number of flights. **Attributes:** `shield`, an `AdaptedShield`; `onboard`.
+    The shield takes the quadrotor's state from the autopilot's reference motion, and the other robots' from
+    measured poses, estimated by the decision core (`sidestep.robot.Onboard`). Compiled once, a `Pilot` serves
+    any number of flights. **Attributes:** `shield`, an `AdaptedShield`; `onboard`.
 
     **Arguments:** `policy` `goal-seeking`, a run folder or any policy; `shield` a name, or an
-    `AdaptedShield` of this scenario, as `sidestep.safety.make_shield` gives it, with a budget of its own.
+    `AdaptedShield` with a budget, as `sidestep.safety.make_shield` returns it for this scenario.
 
     **Raises** `ValueError` as `make_shield`, `TwinError` for a scenario without a quadrotor.
     """
@@ -93,7 +92,7 @@ class Pilot(Robot):
         inner = adapted.unadapted
         if inner is adapted:
             raise ValueError(
-                f"shield = {type(adapted).__name__}: a quadrotor needs one that guards its control point; "
+                f"shield = {type(adapted).__name__}: a quadrotor needs a shield of its control point; "
                 "take it from make_shield(name, scenario, budget) or shield_of(barrier, scenario)"
             )
         self.shield, sensors = adapted, self.options.sensors
@@ -126,7 +125,7 @@ class Pilot(Robot):
         return self.onboard.decide(now)
 
     def _known(self, flight: Flight, seen: World) -> World:
-        """What the policy is shown: the quadrotor as it is asked to move, the others as estimated."""
+        """The world for the policy: the quadrotor's reference motion, and the other robots as estimated."""
         position, velocity, acceleration = (jnp.asarray(part, float) for part in flight.reference)
         return World(
             evader=position,
@@ -140,14 +139,14 @@ class Pilot(Robot):
         )
 
 
-def certificate_of(scenario: Scenario, options: FlightOptions, **told: Any) -> Certificate:
-    """What is guaranteed of the quadrotor's control point, and so of the quadrotor, with these errors.
+def certificate_of(scenario: Scenario, options: FlightOptions, **arguments: Any) -> Certificate:
+    """The certificate of the quadrotor with the errors of these options.
 
-    Of the point, at distances that are the model's offset longer, against the differential drive that covers
-    the aircraft (`Aircraft.covering`). `told` goes to `sidestep.safety.certify`.
+    It is that of the control point, with distances increased by the model's offset, against the differential
+    drive that covers the aircraft (`Aircraft.covering`). `arguments` go to `sidestep.safety.certify`.
     """
     check_scenario(scenario, options)
-    return certify(scenario, **errors_of(options), **told)
+    return certify(scenario, **errors_of(options), **arguments)
 
 
 def fly(
@@ -161,8 +160,8 @@ def fly(
 ) -> FlightEpisode:
     """One flight, see `sidestep.plants.play`.
 
-    **Arguments:** `pilot`, which is reset; `certificate` as `certificate_of` gives it, to say whether the
-    flight began where it holds; the rest as for `play`.
+    **Arguments:** `pilot`, which is reset; `certificate` from `certificate_of`, to compute `start_margin`;
+    the rest as for `play`.
 
     **Raises** as `play`, and `TwinError` when MuJoCo is missing or the flight goes out of control.
     """
@@ -175,7 +174,7 @@ def fly(
 
 
 def _margin(certificate: Certificate, world: World) -> float:
-    """Of the worst-placed pursuer; -inf where nothing is guaranteed."""
+    """The smallest start margin (m) over the pursuers; -inf if the certificate guarantees nothing."""
     if not certificate.guaranteed:
         return -np.inf
     seen = [np.asarray(to_pursuer_frame(world.evader, pose), float) for pose in np.asarray(world.pursuers)]

@@ -1,4 +1,4 @@
-"""Where does the quadrotor think it is? Accelerometer between poses, poses against its drift."""
+"""The quadrotor's estimate of its motion, from accelerations and delayed positions."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Vector = Float[np.ndarray, "3"]
 
 @final
 class OwnMotion:
-    """Position and velocity from accelerations that come often and positions that come seldom and late.
+    """Estimates position and velocity from frequent accelerations and rare, delayed positions.
 
-    A position is compared with what was thought when it was true, and the difference corrects both: the
-    steady-state Kalman gains of a double integrator, for accelerations off by `acceleration_noise` (m/s^2 per
-    root hertz) and positions by `position_noise` (m).
+    A position is compared with the estimate for its time stamp; the difference corrects position and velocity
+    with the steady-state Kalman gains of a double integrator, for noise of `acceleration_noise` (m/s^2 per
+    root hertz) and `position_noise` (m).
     """
 
     def __init__(self, acceleration_noise: float, position_noise: float, pose_period: float):
-        # Kalata's tracking index and the alpha-beta gains that follow from it (IEEE T-AES 1984).
+        # Kalata's tracking index and its alpha-beta gains (IEEE T-AES 1984).
         index = acceleration_noise * pose_period**1.5 / max(position_noise, 1e-6)
         root = (4.0 + index - math.sqrt(8.0 * index + index * index)) / 4.0
         self._alpha = 1.0 - root * root
@@ -30,7 +30,7 @@ class OwnMotion:
         self._pose_period = pose_period
 
     def start(self, now: float, position: Vector, velocity: Vector) -> None:
-        """Begin from here (m, m/s) at `now` (s)."""
+        """Start from this position (m) and velocity (m/s) at `now` (s)."""
         self.position, self.velocity = np.array(position, float), np.array(velocity, float)
         self._past: deque[tuple[float, Vector]] = deque([(now, self.position.copy())], maxlen=256)
 

@@ -1,4 +1,4 @@
-"""Where is everything at every millisecond of a flight, and what has been measured of it?"""
+"""The flight as a plant: quadrotor, autopilot, aircraft, columns and sensors in MuJoCo."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from sidestep.world.robots import body_velocity
 
 _TRAIL, _TILT, _NEAR = 0.006, math.radians(-42.0), 2.0
 _COLUMN = 0.6
-"""Radius of a column, as a share of the collision distance; the quadrotor needs the rest."""
+"""Radius of a column as a share of the collision distance; the rest is the quadrotor's radius."""
 
 
 def _transition(model: Quadrotor, time: float) -> Float[np.ndarray, "4 4"]:
-    """What `time` (s) makes of position, velocity, acceleration and the velocity told, per axis."""
+    """Transition matrix over `time` (s) of position, velocity, acceleration and commanded velocity, per
+    axis."""
     tau, lag = float(model.time_constant), float(model.attitude_lag)
     rate = time * np.array(
         [[0, 1, 0, 0], [0, 0, 1, 0], [0, -1 / (tau * lag), -1 / lag, 1 / (tau * lag)], [0, 0, 0, 0]]
@@ -40,15 +41,15 @@ def _transition(model: Quadrotor, time: float) -> Float[np.ndarray, "4 4"]:
 
 
 class _Aircraft:
-    """Exact motion along the heading; speed and turn rate follow what is told with a lag."""
+    """Exact motion along the heading; speed and turn rate follow the command with a first-order lag."""
 
     def __init__(self, pose: Float[np.ndarray, "3"], speed: float):
         self.pose = np.array(pose, float)
         self.motion = np.array([speed, 0.0])
-        self.told = self.motion.copy()
+        self.command = self.motion.copy()
 
     def step(self, time: float, share: float) -> None:
-        self.motion += share * (self.told - self.motion)
+        self.motion += share * (self.command - self.motion)
         speed, turn_rate = self.motion
         half = 0.5 * turn_rate * time
         chord = speed * time * (math.sin(half) / half if half else 1.0)
@@ -61,12 +62,12 @@ class _Aircraft:
 class Flight(Bodies):
     """The scenario's quadrotor in MuJoCo, flown by its autopilot, with an aircraft and columns.
 
-    What the shield is told of the quadrotor is `reference`: the motion that the commanded velocities make of
-    `Quadrotor`, which the autopilot follows. `tracking_error` (m) is how far the quadrotor has been from it
-    at most. It holds its heading and ignores turn rates; `measurements` are of the others only.
+    The shield takes the quadrotor's state from `reference`: the motion of the model `Quadrotor` under the
+    commanded velocities, which the autopilot follows. `tracking_error` (m) is the largest distance from it so
+    far. The quadrotor holds its heading and ignores turn rates; `measurements` are of the other robots only.
 
-    **Attributes:** as those of `Bodies`; each frame holds MuJoCo's positions `(nq,)`, and positions and
-    quaternions of the mocap bodies. `saturated` s, for how long tilt or rotors were at their limits.
+    **Attributes:** those of `Bodies`; each frame holds MuJoCo's positions `(nq,)`, and positions and
+    quaternions of the mocap bodies. `saturated` s, time with tilt or rotors at their limits.
 
     **Raises** `TwinError` when MuJoCo is missing, or for a scenario without a quadrotor.
     """
@@ -99,7 +100,7 @@ class Flight(Bodies):
         self._autopilot = Autopilot(options.airframe, options.gains)
 
     def _begin(self, world: World, root: np.random.Generator) -> None:
-        """The quadrotor hovers, the aircraft flies straight on."""
+        """Start with the quadrotor hovering and the aircraft flying straight."""
         options, data, pursuers = self.options, self.data, self.counts[0]
         place = np.array([*np.asarray(world.evader, float), options.height])
         data.qpos[:3], data.qpos[3:7] = place, (1.0, 0.0, 0.0, 0.0)
@@ -131,17 +132,18 @@ class Flight(Bodies):
         ]
         moving = np.array([np.zeros(2), *ahead, *self._columns[:, 2:]])
         self._sensors.watch_the_start(self._poses(), moving)
-        # Its own start is known.
+        # The quadrotor knows its start.
         self._sensors.evaders(0.0)
 
     @property
     def reference(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """Position (m), velocity (m/s) and acceleration (m/s^2) that the autopilot is asked for now."""
+        """The autopilot's reference now: position (m), velocity (m/s) and acceleration (m/s^2)."""
         return self._plan[0].copy(), self._plan[1].copy(), self._plan[2].copy()
 
     @property
     def control_point(self) -> Float[np.ndarray, "2"]:
-        """The point (m) of `reference` that moves as told, see `sidestep.world.Quadrotor`."""
+        """The point (m) of `reference` that moves with the commanded velocity, see
+        `sidestep.world.Quadrotor`."""
         tau, lag = self._lags
         return self._plan[0] + tau * (self._plan[1] + lag * self._plan[2])
 
@@ -150,11 +152,11 @@ class Flight(Bodies):
     ) -> None:
         self._plan[3] = self._limited(velocity)
         if len(self._aircraft):
-            for aircraft, told in zip(self._aircraft, self._drivable(wheel_speeds), strict=True):
-                aircraft.told = told
+            for aircraft, command in zip(self._aircraft, self._drivable(wheel_speeds), strict=True):
+                aircraft.command = command
 
     def _drivable(self, wheel_speeds: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
-        """Speeds (m/s) and turn rates (rad/s) that the scenario's pursuer makes of these."""
+        """Speeds (m/s) and turn rates (rad/s) of the scenario's pursuer for these rim speeds."""
         scenario = self.scenario
         taken = [scenario.drivable(np.asarray(pair, np.float32)) for pair in np.asarray(wheel_speeds)]
         return np.array(
@@ -162,7 +164,7 @@ class Flight(Bodies):
         )
 
     def advance(self, duration: float) -> Contacts:
-        """Let `duration` (s) pass, in whole physics steps; returns how near the evader came to what."""
+        """Simulate `duration` (s) in whole physics steps; returns the evader's least distances."""
         options, data, step = self.options, self.data, self.options.physics_step
         count = self._steps_in(duration)
         share = -math.expm1(-step / options.pursuer_lag)
@@ -185,8 +187,8 @@ class Flight(Bodies):
             self._sensors.watch(self._steps, poses[index : index + 1])
         if not np.all(np.isfinite(poses)) or abs(data.qpos[2] - options.height) > 0.5 * options.height:
             raise TwinError(
-                f"the quadrotor lost its height at {self.time:.3f} s: its gains, or its rotors, do not do "
-                "for what it is told"
+                f"the quadrotor lost its height at {self.time:.3f} s: its gains or its rotors are too weak "
+                "for its commands"
             )
         return self._watch.see(poses)
 
@@ -199,28 +201,28 @@ class Flight(Bodies):
         felt = np.asarray(data.qacc[:3]) + self._noise.standard_normal(3) * (
             self.options.acceleration_noise / math.sqrt(period)
         )
-        # Read in the body's axes, and turned back by what is taken for level, gravity too.
+        # The accelerometer measures in body axes; the biased attitude turns it back, gravity included.
         taken = self._level @ rotation
         weight = np.array([0.0, 0.0, GRAVITY])
         felt = taken @ (rotation.T @ (felt + weight)) - weight
         if self._steps:
             self._own.feel(self.time, felt, period)
         for seen in self._sensors.evaders(self.time):
-            # The height is measured by the same cameras.
+            # The same cameras measure the height.
             height = self.data.qpos[2] + self._noise.standard_normal() * self.options.sensors.position_noise
             self._own.see(seen.stamp, np.array([*seen.pose[:2], height]))
         jerk = ((plan[3] - plan[1]) / tau - plan[2]) / lag
         level = (np.array([*part, 0.0]) for part in (plan[1], plan[2], jerk))
-        wanted = Setpoint(np.array([*plan[0], self.options.height]), *level)
+        setpoint = Setpoint(np.array([*plan[0], self.options.height]), *level)
         attitude = Attitude(taken, np.asarray(data.qvel[3:6]).copy())
         own = self._own
-        thrusts = self._autopilot.thrusts(wanted, own.position, own.velocity, attitude, period)
+        thrusts = self._autopilot.thrusts(setpoint, own.position, own.velocity, attitude, period)
         data.ctrl[self._motors] = thrusts
         self.tracking_error = max(self.tracking_error, math.dist(data.qpos[:2], plan[0]))
         self.saturated += period * self._autopilot.saturated
 
     def _show(self) -> None:
-        """Put the bodies that only move where they are."""
+        """Set the poses of the mocap bodies."""
         data, height = self.data, self.options.height
         for body, aircraft in zip(self._mocap, self._aircraft, strict=False):
             speed, turn_rate = aircraft.motion
@@ -236,7 +238,7 @@ class Flight(Bodies):
             data.mocap_pos[body, :2] = column[:2]
 
     def _poses(self) -> Float[np.ndarray, "robots 3"]:
-        """x, y and heading of everybody now, evader first, then pursuers, then columns."""
+        """x, y and heading of all robots now: evader, pursuers, columns."""
         w, x, y, z = self.data.qpos[3:7]
         heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         columns = [[x, y, 0.0] for x, y in self._columns[:, :2]]

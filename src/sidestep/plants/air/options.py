@@ -1,4 +1,4 @@
-"""How is the quadrotor built, and what disturbs it?"""
+"""Options of a flight: the quadrotor, its sensors and disturbances."""
 
 from __future__ import annotations
 
@@ -16,22 +16,20 @@ from sidestep.world import Scenario
 from sidestep.world.flyers import GRAVITY, Quadrotor
 
 ROOM_SENSORS = Sensors(rate=100.0, position_noise=0.001, heading_noise=math.radians(0.25), delay=0.01)
-"""Motion capture of a room for small drones."""
+"""Motion capture in a lab for small drones."""
 
 
 @dataclass(frozen=True)
 class FlightOptions:
-    """Everything about a flight that the scenario does not say.
+    """The parameters of a flight beyond the scenario.
 
-    - `airframe`, `gains`; `sensors` of everybody's poses, the quadrotor's own among them
-    - `tracking_error` m: how far the quadrotor may be from the motion that it is asked for. The shield allows
-      for it, and a flight that breaks it says so
-    - `acceleration_noise` m/s^2 per root hertz and `tilt_bias` rad: errors of its accelerometer, and of what
-      it takes for level
+    - `airframe`, `gains`; `sensors` of all poses, including the quadrotor's
+    - `tracking_error` m: bound on the quadrotor's distance from its reference motion. The shield's budget
+      contains it, and an episode reports when it is exceeded
+    - `acceleration_noise` m/s^2 per root hertz, of the accelerometer; `tilt_bias` rad, of the attitude
     - `wind (2,)` m/s
-    - `pursuer_lag` s: time constant with which the aircraft takes up a speed and a turn rate;
-      `pursuer_sees`, see `PURSUER_SEES`
-    - `height` of everybody, m
+    - `pursuer_lag` s: time constant of the aircraft's speed and turn rate; `pursuer_sees`, see `PURSUER_SEES`
+    - `height` m of all robots
     - `physics_step` and `autopilot_period`, s, the second a multiple of the first
     """
 
@@ -59,13 +57,13 @@ class FlightOptions:
 
 
 def errors_of(options: FlightOptions) -> dict[str, float]:
-    """What bounds the shield's errors, as `Budget` and `certify` take them.
+    """Bounds of the shield's errors, as arguments of `Budget` and `certify`.
 
-    In place the sensors' error of the other robot and how far the quadrotor is from the motion asked of it,
-    which is what the shield knows of it; in heading and delay the sensors'.
+    Position: the sensors' error of the other robot plus the quadrotor's tracking error, because the shield
+    uses its reference motion. Heading and delay: those of the sensors.
     """
     bounds = options.sensors.bounds()
-    # The bound counts both robots as measured; the evader's own place is in `tracking_error`.
+    # The sensors' bound counts both robots as measured; the evader's position error is `tracking_error`.
     position = 0.5 * bounds["position_error"] + options.tracking_error
     return {**bounds, "position_error": position}
 
@@ -77,7 +75,7 @@ def budget_of(options: FlightOptions) -> Budget:
 
 
 def check_scenario(scenario: Scenario, options: FlightOptions) -> None:
-    """**Raises** `TwinError` for a scenario whose evader is no `Quadrotor`, or one that leans too far."""
+    """**Raises** `TwinError` for a scenario whose evader is not a `Quadrotor`, or would tilt too far."""
     model = scenario.evader_model
     if not isinstance(model, Quadrotor):
         raise TwinError(
@@ -87,19 +85,19 @@ def check_scenario(scenario: Scenario, options: FlightOptions) -> None:
         )
     if scenario.pursuer_model is None:
         raise TwinError(
-            f"the scenario '{scenario.name}' sends a differential drive after a quadrotor: set "
-            'pursuer_model = "aircraft", or one of your own'
+            f"the scenario '{scenario.name}' has a differential drive pursue a quadrotor: set "
+            'pursuer_model = "aircraft", or a custom model'
         )
     tilt, most = float(model.largest_tilt(scenario)), options.gains.largest_tilt
     frame = options.airframe
     lift = 4.0 * frame.largest_thrust * math.cos(tilt) / (GRAVITY * frame.mass)
     if tilt >= most or lift <= 1.0:
         why = (
-            f"leans {math.degrees(tilt):.0f} degrees, more than largest_tilt = {math.degrees(most):.0f}"
+            f"tilts {math.degrees(tilt):.0f} degrees, more than largest_tilt = {math.degrees(most):.0f}"
             if tilt >= most
-            else f"leans {math.degrees(tilt):.0f} degrees, where its rotors cannot hold its height"
+            else f"tilts {math.degrees(tilt):.0f} degrees, where its rotors cannot hold its height"
         )
         raise TwinError(
-            f"told any velocity up to {float(scenario.evader_speed):g} m/s, this quadrotor {why}: give its "
+            f"commanded up to {float(scenario.evader_speed):g} m/s, this quadrotor {why}: give its "
             "model a longer time_constant, or a lower evader_speed"
         )

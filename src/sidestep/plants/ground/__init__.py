@@ -1,4 +1,4 @@
-"""How would it go on robots? The scenario in a physics simulator: motors, wheels, noise and delay."""
+"""The twin: the scenario's robots in MuJoCo, with motors, wheels, sensor noise and delay."""
 
 from sidestep.plants.contacts import Contacts, Watch
 from sidestep.plants.ground.episode import TwinEpisode, run_twin, settings_for, twin_episode

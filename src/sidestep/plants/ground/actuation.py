@@ -1,4 +1,4 @@
-"""How does a command reach the motors: when, and as what?"""
+"""From a command to the motors: delay and wheel speeds."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Command = TypeVar("Command")
 
 @final
 class DelayLine(Generic[Command]):
-    """Commands that take effect `delay` (s) after they were given; until one does, the one before holds."""
+    """Commands that take effect after `delay` (s); until then the previous command holds."""
 
     def __init__(self, delay: float, first: Command):
         self._delay, self._held = delay, first
         self._under_way: deque[tuple[float, Command]] = deque()
 
     def give(self, now: float, command: Command) -> None:
-        """Send a command on its way."""
+        """Give a command at `now` (s)."""
         self._under_way.append((now + self._delay, command))
 
     def at(self, now: float) -> Command:
@@ -36,16 +36,16 @@ class DelayLine(Generic[Command]):
 
 
 def yaw_rate(heading: float) -> float:
-    """Turn rate (rad/s) of the slow loop that holds the evader's heading (rad) at 0."""
+    """Turn rate (rad/s) of the controller that holds the evader's heading (rad) at 0."""
     return min(max(-_YAW_GAIN * math.remainder(heading, 2.0 * math.pi), -_MOST_YAW_RATE), _MOST_YAW_RATE)
 
 
 def omniwheel_speeds(velocity: Float[np.ndarray, "2"], heading: float) -> Float[np.ndarray, "3"]:
-    """Speeds (rad/s) of the three omniwheels for a velocity (m/s) in world axes, heading (rad) held at 0.
+    """Speeds w (rad/s) of the three omniwheels for a velocity (m/s) in world axes, heading (rad) held at 0.
 
-    With t the direction in which a wheel rolls the base along, counter-clockwise about its centre, the axle
-    pointing outwards and L the wheel's distance: R w = -(v.t + L yaw rate), v in the robot's axes, and R the
-    radius that the wheels roll with.
+    R w = -(v.t + L yaw_rate), with v in robot axes, R the effective rolling radius, L the wheel's distance
+    from the centre, and t the unit vector perpendicular to the outward axle, counter-clockwise about the
+    centre.
     """
     cosine, sine = math.cos(heading), math.sin(heading)
     ahead = cosine * velocity[0] + sine * velocity[1]

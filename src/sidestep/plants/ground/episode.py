@@ -1,4 +1,4 @@
-"""What happens in one episode on the twin, with the very decision core that a robot runs?"""
+"""One episode on the twin, with the decision core that a robot runs."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from sidestep.world import Scenario, World
 
 @dataclass(frozen=True)
 class TwinEpisode(PlantEpisode):
-    """One episode of T control periods on the twin; `tracking_errors` are in m/s, how far the mean velocity
-    of a period was from the command. `frames` are MuJoCo's positions at 100 Hz."""
+    """One episode of T control periods on the twin. `tracking_errors` (m/s) are |mean velocity - command| of
+    each period. `frames` are MuJoCo's positions at 100 Hz."""
 
     frames: Float[np.ndarray, "n nq"]
     options: TwinOptions
 
     def plant(self) -> Twin:
-        """The twin that it was played on, built anew."""
+        """A new twin like the one used."""
         return Twin(self.scenario, self.options, self.seed)
 
 
 def settings_for(options: TwinOptions) -> OnboardSettings:
-    """What the decision core is told of the twin's sensors and motors.
+    """Settings of the decision core for the twin's sensors and motors.
 
-    Filters average the noise, and predict the pursuer to when a command acts: a standard deviation is allowed
-    for in place, a quarter of one in heading, and the delay of the poses without that of the motors, which is
-    modelled. That is what the paper's numbers leave some use of, not what bounds the errors (`bounded_errors`
-    does): an evader that keeps more is led round in circles and does not arrive, one that keeps less is
-    caught.
+    The budget contains one standard deviation of the position noise, a quarter of one of the heading noise,
+    the delay of the poses and the actuation delay; the motors' lag is modelled. The filters average noise and
+    extrapolate the pursuer to actuation time. This is a compromise for the paper's numbers and does not bound
+    the errors (`bounded_errors` does): with a larger budget the evader circles and does not arrive, with a
+    smaller one it is captured.
     """
     sensors = options.sensors
     return OnboardSettings(
@@ -68,7 +68,7 @@ def run_twin(
     settings: OnboardSettings | None = None,
     world: World | None = None,
 ) -> TwinEpisode:
-    """One episode, as `twin_episode` with a decision core of its own; for many, compile one and use that.
+    """`twin_episode` with a new decision core. For many episodes compile one core and use `twin_episode`.
 
     **Arguments:** `policy` and `shield` as for `evaluate`; `settings` of the decision core, see
     `settings_for`; the rest as for `twin_episode`.
@@ -89,7 +89,7 @@ def twin_episode(
 ) -> TwinEpisode:
     """One episode on the twin, see `sidestep.plants.play`.
 
-    Sensors have been on for half a second when the clock starts.
+    The sensors have run for 0.5 s when the episode starts.
 
     **Arguments:** `onboard` the decision core, with a policy; it is reset. The rest as for `play`.
 

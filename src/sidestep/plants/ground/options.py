@@ -1,4 +1,4 @@
-"""How is the twin built and measured?"""
+"""Options of the twin: motors, delays and sensors."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sidestep.world import Scenario
 
 @dataclass(frozen=True)
 class TwinOptions:
-    """Everything about the twin that the scenario does not say.
+    """The parameters of the twin beyond the scenario.
 
     - `base` of the evader, see `BASES`; `acceleration` m/s^2, the limit of its motors; `lag` s, the time
       constant of its velocity servos; `pursuer_lag` s, that of the pursuers' wheels
-    - `sensors`; `actuation_delay` s from a command to its effect, of the evader
+    - `sensors`; `actuation_delay` s of the evader, from a command to its effect
     - `pursuer_sees`, see `PURSUER_SEES`
     - `physics_step` s
     """
@@ -37,10 +37,10 @@ class TwinOptions:
 
 
 def bounded_errors(scenario: Scenario, options: TwinOptions) -> dict[str, float]:
-    """The twin's errors as `sidestep.safety.certify` takes them.
+    """Bounds of the twin's errors, as arguments of `sidestep.safety.certify`.
 
-    The sensors' bounds, and in `delay` (s) also what passes until the motors obey: the actuation delay, the
-    servos' time constant, and half the time that a full reversal takes at the greatest acceleration.
+    They are those of the sensors. `delay` (s) also contains the actuation delay, the servos' time constant,
+    and half the time of a full reversal at the largest acceleration.
     """
     bounds = options.sensors.bounds()
     reversal = 2.0 * float(scenario.evader_speed) / options.acceleration

@@ -1,9 +1,9 @@
-"""What are the robots built of? Bodies, wheels, rollers and motors as MJCF, from the scenario's numbers.
+"""MuJoCo models of the robots: bodies, wheels, rollers and motors as MJCF, from the scenario's numbers.
 
-Small laboratory robots of 2 to 4 kg. Only wheels, rollers and casters touch anything, and only the floor:
-capture and collision are distances between centres, as in the scenario. Bodies cannot stand for them: with
-the paper's numbers the pursuer's wheels stand on the rim of its own capture disc, so that no evader has room
-beside its axle.
+They are laboratory robots of 2 to 4 kg. Only wheels, rollers and casters have contacts, and only with the
+floor: capture and collision are distances between centres, as in the scenario. Contacts between bodies cannot
+replace them: with the paper's numbers the pursuer's wheels are at the edge of its capture disc, which leaves
+no room for an evader beside the axle.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ WHEEL_RADIUS = 0.05
 OMNIWHEEL_RADIUS, OMNIWHEEL_ARM = 0.04, 0.085
 """Radius of an omniwheel and its distance from the evader's centre, m."""
 OMNIWHEEL_ROLLING = 0.9863
-"""What a turn of the wheels makes of the way that it should: rollers slip and motors under load droop. The
-base is calibrated by this, as one is by driving it straight at full speed and measuring."""
+"""Driven distance over nominal distance of the wheels, less than 1 because rollers slip and loaded motors
+droop. Calibrates the base; measured by driving straight at full speed."""
 OMNIWHEEL_ANGLES = tuple(math.radians(angle) for angle in (60.0, 180.0, 300.0))
 """Directions of the omniwheels' axles from the evader's centre, rad from its x axis."""
 _ROLLERS = 10
@@ -35,9 +35,9 @@ _PURSUER_ACCELERATION = 4.0
 
 
 def pursuer_body(index: int, half_axle: float, colour: str) -> str:
-    """A differential drive: chassis, two driven wheels 2b apart, a ball caster before and one behind.
+    """A differential drive: chassis, two driven wheels 2b apart, a ball caster in front and one behind.
 
-    A wheel touches the floor at one point, on its centre line: the axle is exactly 2b long.
+    A wheel touches the floor at one point on its centre line, so the track is exactly 2b.
     """
     length, width = max(0.75 * half_axle, 0.05), max(half_axle - 0.025, 0.02)
     caster = 0.8 * length
@@ -70,7 +70,7 @@ def pursuer_body(index: int, half_axle: float, colour: str) -> str:
 
 
 def pursuer_motors(index: int, lag: float) -> str:
-    """Velocity servos of the wheels; `lag` (s) is the time constant with which the robot follows them."""
+    """Velocity servos of the wheels; `lag` (s) is the robot's time constant."""
     load = (0.5 * _CHASSIS_MASS + 1.5 * _WHEEL_MASS) * WHEEL_RADIUS**2 + _MOTOR_ARMATURE
     torque = _PURSUER_ACCELERATION * load / WHEEL_RADIUS
     return "".join(
@@ -82,7 +82,7 @@ def pursuer_motors(index: int, lag: float) -> str:
 
 
 def evader_body(base: str, colour: str) -> str:
-    """The omnidirectional evader on its planar joints or on its wheels."""
+    """The omnidirectional evader on planar joints or on omniwheels, see `BASES`."""
     top = f"""
       <geom class="shown" type="cylinder" size="{EVADER_RADIUS} 0.03" pos="0 0 {{deck}}"
             rgba="{mjcf_colour(colour)}"/>
@@ -110,7 +110,7 @@ def evader_body(base: str, colour: str) -> str:
 def _omniwheel(index: int, angle: float) -> str:
     """A wheel whose rim is made of passive barrel-shaped rollers, free to turn about the rim's tangent.
 
-    An ellipsoid with half axes sqrt(c R) and c has the wheel's curvature 1/R where it stands out most.
+    An ellipsoid with half axes sqrt(c R) and c has the wheel's curvature 1/R at its outermost point.
     """
     radius, thin = OMNIWHEEL_RADIUS, _ROLLER_RADIUS
     barrel = math.sqrt(thin * radius)
@@ -135,8 +135,8 @@ def _omniwheel(index: int, angle: float) -> str:
 
 
 def evader_motors(base: str, lag: float, acceleration: float) -> str:
-    """Velocity servos with force limits; `lag` (s) is their time constant, `acceleration` (m/s^2) the limit
-    along either axis (`servo`), or in the direction in which the wheels push least (`omniwheels`)."""
+    """Velocity servos with force limits. `lag` (s) is their time constant; `acceleration` (m/s^2) the limit
+    along each axis (`servo`), or in the direction of least wheel force (`omniwheels`)."""
     if base == "servo":
         gain, force = EVADER_MASS / lag, EVADER_MASS * acceleration
         turn, torque = YAW_INERTIA / lag, YAW_INERTIA * acceleration / EVADER_RADIUS
@@ -144,7 +144,7 @@ def evader_motors(base: str, lag: float, acceleration: float) -> str:
     <velocity name="evader_x" joint="evader_x" kv="{gain}" forcerange="{-force} {force}"/>
     <velocity name="evader_y" joint="evader_y" kv="{gain}" forcerange="{-force} {force}"/>
     <velocity name="evader_yaw" joint="evader_yaw" kv="{turn}" forcerange="{-torque} {torque}"/>"""
-    # Three wheels at 120 degrees push a mass as 3/2 of one wheel would.
+    # Three wheels at 120 degrees apply 3/2 of one wheel's force to the mass.
     load = EVADER_MASS / 1.5 * OMNIWHEEL_RADIUS**2 + _MOTOR_ARMATURE
     torque = acceleration * load / OMNIWHEEL_RADIUS * 1.5 / math.sqrt(3.0)
     return "".join(
@@ -156,7 +156,7 @@ def evader_motors(base: str, lag: float, acceleration: float) -> str:
 
 
 def obstacle_body(index: int, colour: str) -> str:
-    """A post on planar joints that drifts at the velocity it is given."""
+    """A post on planar joints that drifts at the commanded velocity."""
     return f"""
     <body name="obstacle{index}">
       <inertial pos="0 0 0.06" mass="2" diaginertia="0.01 0.01 0.01"/>

@@ -1,4 +1,4 @@
-"""Where is every robot at every millisecond, and what has been measured of it?"""
+"""The twin as a plant: the scenario's robots and sensors in MuJoCo."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _COLOURS = ("#0072B2", "#D55E00", "#595959")
 
 
 class _Places:
-    """Where in MuJoCo's state each robot is found."""
+    """Indices of each robot in MuJoCo's state."""
 
     def __init__(self, model: Any, base: str, pursuers: int, obstacles: int):
         def motors(*names: str) -> list[int]:
@@ -49,7 +49,7 @@ class _Places:
 
 
 def _heading(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n"]:
-    """Turn about the vertical (rad) of unit quaternions w, x, y, z."""
+    """Headings (rad) of unit quaternions w, x, y, z."""
     w, x, y, z = quaternions.T
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -58,12 +58,12 @@ def _heading(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n"]:
 class Twin(Bodies):
     """The scenario's robots as bodies with motors, wheels and friction, in MuJoCo.
 
-    `tracking_error` is how far the evader's mean velocity since its last command is from that, m/s. The
-    evader holds its heading and ignores turn rates.
+    `tracking_error` (m/s) is |mean velocity since the last command - command| of the evader. The evader holds
+    its heading and ignores turn rates.
 
-    **Attributes:** as those of `Bodies`; each frame holds MuJoCo's positions `(nq,)`.
+    **Attributes:** those of `Bodies`; each frame holds MuJoCo's positions `(nq,)`.
 
-    **Raises** `TwinError` when MuJoCo is missing, `ValueError` for robots of one's own.
+    **Raises** `TwinError` when MuJoCo is missing, `ValueError` for custom robots.
     """
 
     options: TwinOptions
@@ -89,7 +89,7 @@ class Twin(Bodies):
     def _begin(self, world: World, root: np.random.Generator) -> None:
         places, data = self._places, self.data
         self._place(world)
-        # Wheels sink a tenth of a millimetre into the floor; let them before the clock starts.
+        # Let the wheels settle by about 0.1 mm into the floor before the episode starts.
         for _ in range(round(_SETTLE / self.options.physics_step)):
             self._mujoco.mj_step(self.model, data)
         data.qvel[:] = 0.0
@@ -113,7 +113,7 @@ class Twin(Bodies):
         return np.array(drifts, float).reshape(-1, 2)
 
     def _place(self, world: World) -> None:
-        """Set x, y and heading of everything; heights stay."""
+        """Set x, y and heading of all robots; heights do not change."""
         qpos, places = self.data.qpos, self._places
         qpos[places.evader : places.evader + 2] = np.asarray(world.evader, float)
         if places.floating:
@@ -127,13 +127,13 @@ class Twin(Bodies):
     def command(
         self, velocity: Float[np.ndarray, "2"], wheel_speeds: Float[np.ndarray, "m 2"], turn_rate: float = 0.0
     ) -> None:
-        """As `Plant.command`; the evader's takes effect after the actuation delay."""
+        """As `Plant.command`; the evader's command takes effect after the actuation delay."""
         self._velocity.give(self.time, self._limited(velocity))
         self._wheels = np.clip(np.nan_to_num(np.asarray(wheel_speeds, float)), -self._top, self._top)
         self._since, self._from, self._wanted = self.time, self._evader(), np.asarray(velocity)
 
     def _evader(self) -> Float[np.ndarray, "2"]:
-        """Where the evader is (m), in the precision of a `World`."""
+        """The evader's position (m) in the precision of a `World`."""
         first = self._places.evader
         return self.data.qpos[first : first + 2].astype(np.float32)
 
@@ -145,7 +145,7 @@ class Twin(Bodies):
         return float(np.hypot(*((self._evader() - self._from) / elapsed - self._wanted)))
 
     def advance(self, duration: float) -> Contacts:
-        """Let `duration` (s) pass, in whole physics steps; returns how near the evader came to what."""
+        """Simulate `duration` (s) in whole physics steps; returns the evader's least distances."""
         count = self._steps_in(duration)
         data, model, mj_step, places = self.data, self.model, self._mujoco.mj_step, self._places
         trace = np.empty((count, model.nq))
@@ -177,7 +177,7 @@ class Twin(Bodies):
         self.data.ctrl[self._places.evader_motors] = speeds
 
     def poses_of(self, trace: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, "n robots 3"]:
-        """x, y and heading of every robot, evader first, then pursuers, then obstacles, along a trace."""
+        """x, y and heading of all robots along a trace; order: evader, pursuers, obstacles."""
         places = self._places
         count = 1 + len(places.pursuers) + len(places.obstacles)
         poses = np.zeros((len(trace), count, 3))
