@@ -1,1 +1,1 @@
-"""What is kept on disk, and how is it never lost?"""
+"""Files on disk: whole-file writes, locks, run folders, checkpoints, campaign results."""

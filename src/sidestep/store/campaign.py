@@ -1,4 +1,4 @@
-"""The folder of a campaign: every job's result there exactly once, whoever is killed, and when."""
+"""The folder of a campaign. It keeps exactly one result per job, even if processes are killed."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _CANNOT_LINK = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EX
 class Store:
     """The results of a campaign in its folder.
 
-    `campaign.json` (which folder this is), `campaign.toml` (what was asked for), `results/JOB.json` (one job
-    each), `runs/JOB/` (what trainings leave), `locks/`. A result is first written whole beside its place,
-    then put there by a hard link, which fails if another is there: the first complete result stays.
+    `campaign.json` (the folder's identity), `campaign.toml` (the campaign file), `results/JOB.json` (one per
+    job), `runs/JOB/` (run folders of trainings), `locks/`. A result is first written completely to another
+    name, then moved by a hard link, which fails if the file exists: the first complete result stays.
     """
 
     def __init__(self, folder: str | Path):
@@ -45,7 +45,7 @@ class Store:
 
     @property
     def token(self) -> str | None:
-        """The random word by which a worker knows the folder as the same; None where there is no campaign."""
+        """The random token by which a worker recognises the folder; None if it holds no campaign."""
         if not (self.folder / "campaign.json").is_file():
             return None
         about = read_json(self.folder / "campaign.json")
@@ -57,7 +57,7 @@ class Store:
         return str(about["token"])
 
     def begin(self, name: str, text: str) -> None:
-        """Make the folder ready for a campaign, a new one or the one that it holds.
+        """Prepare the folder for a campaign, a new one or the one it holds.
 
         **Raises** `ValueError` when it holds something else.
         """
@@ -75,7 +75,7 @@ class Store:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """While this lasts, no other command works on the folder; a killed one no longer does.
+        """A context in which no other command works on the folder. A killed command releases it.
 
         **Raises** `FolderInUseError` when another does, `ValueError` when the folder holds something else.
         """
@@ -94,11 +94,12 @@ class Store:
             raise ValueError(f"{self.folder} holds other files and no campaign; choose another --out")
 
     def lock(self, job: str) -> AbstractContextManager[None]:
-        """Held by the process that runs the job: a worker taken for dead does not run it beside another."""
+        """The lock of the process that runs a job, so that a worker considered dead does not run it in
+        parallel."""
         return hold_files(self.folder / "locks" / f"{job}.lock", wait=True)
 
     def run_folder(self, job: str) -> Path:
-        """Where a training of this job is kept."""
+        """The run folder of this job's training."""
         return self.folder / "runs" / job
 
     def path(self, job: str) -> Path:
@@ -106,7 +107,7 @@ class Store:
         return self._results / f"{job}.json"
 
     def read(self, job: str) -> dict[str, Any] | None:
-        """The record of a job, None if there is none. A damaged file is set aside and counts as none."""
+        """The record of a job; None if there is none. A damaged file is renamed and counts as none."""
         path = self.path(job)
         try:
             content = path.read_bytes()
@@ -127,7 +128,7 @@ class Store:
         return record
 
     def keep(self, record: Mapping[str, Any]) -> bool:
-        """Put a record in its place unless a whole one is there; says whether it was put there."""
+        """Store a record unless a complete one exists; returns whether it was stored."""
         job = record["job"]
         path = self.path(job)
         beside = path.with_name(f".{job}.{uuid.uuid4().hex}.tmp")
@@ -144,11 +145,11 @@ class Store:
         return True
 
     def jobs(self) -> set[str]:
-        """The jobs that have a file."""
+        """The jobs with a result file."""
         return {path.stem for path in self._results.glob("*.json") if not path.name.startswith(".")}
 
     def damaged(self) -> int:
-        """Files that were set aside since the folder was begun."""
+        """Number of damaged files renamed since the folder was created."""
         return len(list(self._results.glob("*.damaged")))
 
 
@@ -159,7 +160,7 @@ def _sealed(record: Mapping[str, Any]) -> bytes:
 
 
 def _unsealed(content: bytes) -> dict[str, Any] | None:
-    """The record in a file; None when any of it is missing or changed."""
+    """The record in a file; None if it is incomplete or changed."""
     try:
         whole = json.loads(content)
         record = whole["record"]
@@ -179,7 +180,7 @@ def _write_synced(path: Path, content: bytes) -> None:
 
 
 def _link(beside: Path, path: Path) -> bool:
-    """Give the file its place; False when there is one already."""
+    """Move the file to its final name; False if that exists already."""
     try:
         os.link(beside, path)
     except FileExistsError:
@@ -187,7 +188,7 @@ def _link(beside: Path, path: Path) -> bool:
     except OSError as error:
         if error.errno not in _CANNOT_LINK:
             raise
-        # No hard links here (FAT, some network drives): whole all the same, or found damaged and run again.
+        # No hard links (FAT, some network drives): a partial file is detected, and the job run again.
         try:
             _write_synced(path, beside.read_bytes())
         except FileExistsError:

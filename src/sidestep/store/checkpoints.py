@@ -1,7 +1,7 @@
-"""Checkpoints: the whole training state as plain arrays, written whole or not at all.
+"""Checkpoints: the complete training state as plain arrays, written whole or not at all.
 
-A checkpoint is one `.npz` file of named arrays without pickled objects, plus a digest of its content; a kill
-at any moment leaves the one before it intact. Only the part of the replay that has been filled is stored.
+A checkpoint is one `.npz` file of named arrays without pickled objects, with a digest of its content. A kill
+at any time leaves the previous one intact. Only the filled part of the replay is stored.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Tree = TypeVar("Tree")
 
 
 class CheckpointError(RunError):
-    """A checkpoint that cannot be used: damaged, or of another kind of training."""
+    """An unusable checkpoint: damaged, or of a different training."""
 
 
 def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
@@ -62,10 +62,10 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, **about: Any) -> None:
-    """Write a pytree of arrays, whole or not at all, with `about` beside them.
+    """Write a pytree of arrays and the metadata `about`, whole or not at all.
 
-    Of leaves at or below a name in `rows` only that many first rows are kept; reading fills them up again
-    with the example's rows, which may be more than there were.
+    Of leaves at or below a name in `rows` only that many leading rows are stored. On reading, the other rows
+    are taken from the example, which may have more rows than the stored tree.
     """
     rows = rows or {}
     arrays = {name: _plain(leaf)[: _rows_of(name, rows)] if _rows_of(name, rows) is not None else _plain(leaf)
@@ -78,7 +78,7 @@ def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, *
 
 
 def _slots(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    # Pytree paths make poor file names inside a zip; positions with the names beside them do not.
+    # Pytree paths are bad file names inside a zip, so arrays are numbered and the names stored separately.
     names = np.frombuffer(json.dumps(list(arrays)).encode(), np.uint8)
     return {"names": names, **{f"leaf{i}": array for i, array in enumerate(arrays.values())}}
 
@@ -86,7 +86,7 @@ def _slots(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays by pytree path, and the manifest. **Raises** `CheckpointError` when the file is damaged."""
     try:
-        # From memory: NumPy leaves a file that it cannot make sense of open.
+        # From memory, because NumPy leaves an invalid file open.
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             manifest = json.loads(bytes(file[_MANIFEST]))
             names = json.loads(bytes(file["names"]))
@@ -94,7 +94,7 @@ def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except FileNotFoundError:
         raise CheckpointError(f"{path} does not exist") from None
     except Exception as error:
-        # Damage shows as whatever the first broken byte leads NumPy, zip or JSON into.
+        # A damaged file may cause any exception of NumPy, zip or JSON.
         raise CheckpointError(f"{path} is damaged: {error or type(error).__name__}") from None
     if _digest(arrays) != manifest.get("digest"):
         raise CheckpointError(f"{path} is damaged: its digest differs from its content's")
@@ -102,9 +102,9 @@ def read_named(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
-    """The pytree that `write_arrays` stored, shaped like `example`, and what was stored beside it.
+    """The pytree of `write_arrays`, with the shapes of `example`, and its metadata.
 
-    **Raises** `CheckpointError` when the file is damaged or does not fit `example`.
+    **Raises** `CheckpointError` when the file is damaged or does not match `example`.
     """
     arrays, manifest = read_named(path)
     leaves = []
@@ -133,7 +133,7 @@ def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
 
 
 def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> Path:
-    """Write the training state after the episodes it has seen; the two newest checkpoints are kept."""
+    """Write the training state as the newest checkpoint; the two newest are kept."""
     folder = Path(folder) / "checkpoints"
     episodes = int(state.episodes)
     folder.mkdir(exist_ok=True)
@@ -166,12 +166,12 @@ def _episodes_of(path: Path) -> int:
 
 
 def read_checkpoint(folder: str | Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
-    """The newest checkpoint of a run that is whole.
+    """The newest valid checkpoint of a run.
 
-    One that is damaged on disk falls back on the one before it, with a `DamageWarning` that says which file
-    is damaged, from which episode the run goes on, and what was lost.
+    Damaged checkpoints are skipped, with a `DamageWarning` that names the file, the episode from which the
+    run continues, and what was lost.
 
-    **Raises** `CheckpointError` when there is none, or none that fits `example`.
+    **Raises** `CheckpointError` when there is none, or none that matches `example`.
     """
     problems: list[CheckpointError] = []
     for path in reversed(list_checkpoints(folder)):

@@ -1,4 +1,4 @@
-"""What is said when something on disk is damaged, and the work goes on without it?"""
+"""The warning about a damaged file that was skipped."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 
 class DamageWarning(UserWarning):
-    """A file is damaged and was passed over; the text names it, and says what was lost and what follows."""
+    """A damaged file was skipped; the text names it, what was lost, and the consequence."""
 
 
 @contextmanager
 def damage_on_stderr() -> Iterator[None]:
-    """While this lasts, each `DamageWarning` is one line on the error stream."""
+    """A context in which each `DamageWarning` is printed as one line on the error stream."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", DamageWarning)
         shown = warnings.showwarning

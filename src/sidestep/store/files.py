@@ -1,4 +1,4 @@
-"""How does a file get onto the disk whole or not at all, and what is said when it cannot?"""
+"""Write files whole or not at all, with clear errors."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 _STREAMS = {"/dev/stdin": 0, "/dev/stdout": 1, "/dev/stderr": 2}
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 PROBE = ".sidestep-"
-"""How the name of a folder begins in which `try_outputs` tries to write; the process comes next."""
+"""Prefix of the folders in which `try_outputs` tests writing; the process id follows."""
 _RESULT = re.compile(r"[0-9a-f]{32}")
 _OLD_SECONDS = 3600.0
 
 
 class OutputError(ValueError):
-    """A file or folder that cannot be written; the message says what, where and why.
+    """A file or folder that cannot be written; the message says which and why.
 
-    **Attributes:** `path` of the file or folder; `full` whether the disk, or a quota, is full.
+    **Attributes:** `path` of the file or folder; `full` whether the disk or a quota is full.
     """
 
     def __init__(self, path: str | Path, words: str, *, full: bool = False):
@@ -41,11 +41,11 @@ class OutputError(ValueError):
         self.path, self.full = Path(path), full
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Campaigns hand it from one process to another.
+        # Campaigns pass it between processes.
         return _output_error, (self.path, str(self), self.full)
 
     def and_kept(self, words: str) -> OutputError:
-        """The same error, which also says what is kept and how to go on."""
+        """The same error, whose message also says what is kept and how to continue."""
         more = OutputError(self.path, f"{self}. {words}", full=self.full)
         more.__cause__ = self.__cause__
         return more
@@ -56,11 +56,11 @@ def _output_error(path: Path, words: str, full: bool) -> OutputError:
 
 
 class UnreadableError(ValueError):
-    """A file that cannot be read as what it should be."""
+    """A file that cannot be read, or has another format."""
 
 
 def json_safe(value: Any) -> Any:
-    """`value` as plain JSON: arrays become lists, numbers that are not finite become null."""
+    """`value` as JSON values: arrays become lists, non-finite numbers become None."""
     if isinstance(value, Mapping):
         return {str(key): json_safe(item) for key, item in value.items()}
     if isinstance(value, (str, bool)) or value is None:
@@ -78,9 +78,9 @@ def json_safe(value: Any) -> Any:
 
 @contextmanager
 def writing(path: str | Path, needed: int | None = None) -> Iterator[None]:
-    """Turns what the system refuses meanwhile into one sentence about `path`.
+    """Turns an `OSError` of the context into a message about `path`.
 
-    **Arguments:** `needed` bytes for all of it, if that is known.
+    **Arguments:** `needed` bytes in total, if known.
 
     **Raises** `OutputError` for an `OSError`.
     """
@@ -92,7 +92,7 @@ def writing(path: str | Path, needed: int | None = None) -> Iterator[None]:
         if error.errno == errno.ENOSPC and not is_stream(path):
             amount.append(f"{size_words(free_bytes(path))} free")
         reason = error.strerror or str(error) or type(error).__name__
-        # Libraries that hand the number over alone say no more than "Errno 28".
+        # Some libraries pass only the number, with the text "Errno 28".
         reason = os.strerror(error.errno) if error.errno is not None and "rrno" in reason else reason
         words = f"{path} could not be written: {reason[0].lower()}{reason[1:]}"
         if amount:
@@ -101,7 +101,7 @@ def writing(path: str | Path, needed: int | None = None) -> Iterator[None]:
 
 
 def free_bytes(path: str | Path) -> int:
-    """Bytes that are free where `path` lies, or is to lie; 0 where that cannot be found out."""
+    """Free bytes on the disk of `path`, which need not exist; 0 if unknown."""
     folder = Path(path).absolute()
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -112,7 +112,7 @@ def free_bytes(path: str | Path) -> int:
 
 
 def size_words(count: int) -> str:
-    """A number of bytes for people."""
+    """A number of bytes with a suitable unit."""
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.1f} {unit}"
@@ -120,7 +120,7 @@ def size_words(count: int) -> str:
 
 
 def make_folder(folder: str | Path) -> Path:
-    """A folder, and those on the way to it. **Raises** `OutputError` where there can be none."""
+    """Create a folder and its parents. **Raises** `OutputError` if that fails."""
     folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,7 @@ def make_folder(folder: str | Path) -> Path:
 
 
 def is_stream(path: str | Path) -> bool:
-    """Whether this is a pipe or a device, such as /dev/stdout: written into, and not replaced."""
+    """Whether this is a pipe or a device, such as /dev/stdout, which is written to and not replaced."""
     if descriptor_of(path) is not None:
         return True
     try:
@@ -139,7 +139,7 @@ def is_stream(path: str | Path) -> bool:
 
 
 def descriptor_of(path: str | Path) -> int | None:
-    """The file descriptor that a path such as /dev/stdout or /dev/fd/3 names."""
+    """The file descriptor of a path such as /dev/stdout or /dev/fd/3; None for other paths."""
     text = str(path)
     found = _DESCRIPTOR.fullmatch(text)
     return int(found.group(1)) if found else _STREAMS.get(text)
@@ -147,15 +147,15 @@ def descriptor_of(path: str | Path) -> int | None:
 
 @contextmanager
 def whole_file(path: str | Path, needed: int | None = None) -> Iterator[Path]:
-    """A path beside `path` to write to; what is there at the end takes its place, and nothing if that fails.
+    """Write a file whole or not at all: yields a temporary path, whose file replaces `path` at the end.
 
-    Synced to disk, renamed over `path`, and the folder synced too: a reader, or a restart after a kill, sees
-    the old file or the new one. Folders on the way are made; a link is followed. A pipe or a device gets the
-    whole content at the end.
+    The file is synced, renamed to `path`, and the folder synced, so that a reader, or a restart after a kill,
+    sees the old file or the new one. After an error `path` is unchanged. Missing folders are created; a link
+    is followed. A pipe or a device gets the whole content at the end.
 
-    **Arguments:** `needed` bytes, if that is known, for the message.
+    **Arguments:** `needed` bytes, if known, for the message.
 
-    **Raises** `OutputError` for what the system refuses.
+    **Raises** `OutputError` for an `OSError`.
     """
     if is_stream(path):
         with _into_stream(Path(path)) as beside:
@@ -175,7 +175,7 @@ def whole_file(path: str | Path, needed: int | None = None) -> Iterator[Path]:
             with suppress(OSError):
                 beside.unlink(missing_ok=True)
             if isinstance(error, OutputError) and error.path == beside:
-                # Who asked for a file knows it by its name.
+                # Report the name that the user gave.
                 raise OutputError(
                     path, str(error).replace(str(beside), str(path)), full=error.full
                 ) from error
@@ -191,19 +191,19 @@ def _into_stream(path: Path) -> Iterator[Path]:
         content = beside.read_bytes()
     descriptor = descriptor_of(path)
     if descriptor in (1, 2):
-        # What was printed before comes before it.
+        # Flush earlier output first.
         (sys.stdout if descriptor == 1 else sys.stderr).flush()
     with writing(path, len(content)), open(path if descriptor is None else os.dup(descriptor), "wb") as file:
         file.write(content)
 
 
 def sweep(folder: str | Path, *, below: bool = True) -> None:
-    """Remove what kills in the middle of `whole_file` and `try_outputs` have left in a folder and `below` it.
+    """Remove temporary files of killed `whole_file` and `try_outputs` in a folder, and `below` it.
 
-    What names a process counts as left when that process is gone; a campaign's result, whose name ends in 32
-    hexadecimal digits because its worker may be on another host, when it is an hour old. All else stays.
+    A file that names a process is removed if that process has ended. A campaign's temporary result, which
+    ends in 32 hexadecimal digits because its worker may be on another host, is removed after an hour.
     """
-    # Unlike `rglob`, `os.walk` passes over a folder that vanishes meanwhile.
+    # Unlike `rglob`, `os.walk` skips a folder that disappears during the walk.
     for inside, folders, names in os.walk(folder):
         for name in names:
             path = Path(inside, name)
@@ -243,9 +243,9 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def append_bytes(path: str | Path, content: bytes, *, sync: bool = False) -> None:
-    """Append to a file at once and unbuffered: all of it is there or, after an error, nothing.
+    """Append to a file in one unbuffered write: after an error nothing of it is there.
 
-    **Raises** `OutputError` for what the system refuses.
+    **Raises** `OutputError` for an `OSError`.
     """
     with writing(path, len(content)), open(path, "ab", buffering=0) as file:
         before = file.seek(0, os.SEEK_END)
@@ -261,7 +261,7 @@ def append_bytes(path: str | Path, content: bytes, *, sync: bool = False) -> Non
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync what a folder lists to disk, where the system can do that."""
+    """Sync a folder's entries to disk, if the system supports that."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -272,13 +272,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write `data` as JSON, whole or not at all; numbers that are not finite become null."""
+    """Write `data` as JSON, whole or not at all; non-finite numbers become null."""
     text = json.dumps(json_safe(data), indent=2, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
 
 
 def read_json(path: str | Path) -> Any:
-    """What `write_json` wrote. **Raises** `UnreadableError` when the file is missing or no JSON."""
+    """Read a JSON file. **Raises** `UnreadableError` when it is missing or invalid."""
     path = Path(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))

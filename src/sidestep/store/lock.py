@@ -1,9 +1,8 @@
-"""Who writes in this folder? One at a time, and whoever comes second learns who the first is.
+"""Lock a folder so that one process at a time writes in it; others learn which one.
 
-The lock is the operating system's, on the file `.lock` in the folder: it ends with the process, however that
-ends. `.lock.json` beside it says who holds it, and its time of change is renewed while that process lives:
-where locks do not reach across a network file system, that tells a live holder on another host from a dead
-one.
+The lock is the operating system's, on the file `.lock` in the folder, and ends with the process. `.lock.json`
+names the holder. Its modification time is updated while that process lives, which shows whether a holder on
+another host is alive where locks do not work across a network file system.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ _NOTE = ".json"
 _POLL_SECONDS = 0.2
 _SIGN_SECONDS = 10.0
 _SILENT_SECONDS = 60.0
-"""Without a sign of life for so long, a holder on another host counts as dead."""
+"""Time (s) without an update after which a holder on another host counts as dead."""
 
 _held: dict[str, tuple[int, int]] = {}
-"""Process and thread that hold a lock file, by its real path."""
+"""Process and thread that hold a lock file, by the file's real path."""
 
 
 class FolderInUseError(ValueError):
-    """Someone else writes in the folder; the message says who, where and since when."""
+    """Another process writes in the folder; the message says which, on which host and since when."""
 
 
 def is_vacant(entry: Path) -> bool:
-    """Whether there is nothing here but what locks and tries of outputs leave: a lock file, a folder of
-    nothing else."""
+    """Whether this is only what locks and tests of outputs leave: a lock file, or a folder with nothing
+    else."""
     if entry.name.startswith(PROBE):
         return True
     if entry.is_dir() and not entry.is_symlink():
@@ -50,12 +49,12 @@ def is_vacant(entry: Path) -> bool:
 
 @contextmanager
 def hold(*folders: str | Path, wait: bool = False) -> Iterator[None]:
-    """While this lasts, no other process or thread that asks writes in these folders.
+    """A context that locks these folders against other processes and threads that call `hold`.
 
-    Folders are made as needed, and taken away again if nothing was put there. The thread that holds a folder
-    may hold it again, inside.
+    Missing folders are created, and removed again if they stay empty. The thread that holds a folder may hold
+    it again inside the context.
 
-    **Arguments:** `wait` for whoever holds one instead of raising.
+    **Arguments:** `wait` for the holder instead of raising.
 
     **Raises** `FolderInUseError` when another process or thread holds one of them, `ValueError` when one
     cannot be written in.
@@ -66,7 +65,7 @@ def hold(*folders: str | Path, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def hold_files(*files: str | Path, wait: bool = False) -> Iterator[None]:
-    """As `hold`, by the names of the lock files."""
+    """As `hold`, for lock files given by name."""
     ended = threading.Event()
     with ExitStack() as stack:
         notes = [
@@ -80,7 +79,7 @@ def hold_files(*files: str | Path, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _taken(file: Path, wait: bool) -> Iterator[Path | None]:
-    """Hold one lock file; gives the note beside it, None where this thread holds it already."""
+    """Hold one lock file; yields the path of its note, None if this thread holds it already."""
     name, me = os.path.realpath(file), (os.getpid(), threading.get_ident())
     if _held.get(name) == me:
         yield None
@@ -109,7 +108,7 @@ def _taken(file: Path, wait: bool) -> Iterator[Path | None]:
     try:
         yield note
     finally:
-        # A fork inherits what is here, but holds nothing.
+        # A forked process inherits this entry, but not the lock.
         if os.getpid() == me[0]:
             del _held[name]
             note.unlink(missing_ok=True)
@@ -118,7 +117,7 @@ def _taken(file: Path, wait: bool) -> Iterator[Path | None]:
 
 
 def _take_away(made: list[Path], file: Path) -> None:
-    """Remove the folders that were made for the lock, if nothing else came there."""
+    """Remove the folders that were created for the lock, if they are empty."""
     with suppress(OSError):
         if made and list(file.parent.iterdir()) == [file]:
             file.unlink()
@@ -132,7 +131,7 @@ def _about_this_process() -> dict[str, Any]:
 
 
 def _read(note: Path) -> dict[str, Any]:
-    """What a note says; empty when there is none, or it is just being written."""
+    """The content of a note; empty if it is missing or being written."""
     try:
         about = json.loads(note.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -141,12 +140,12 @@ def _read(note: Path) -> dict[str, Any]:
 
 
 def _alive_elsewhere(file: Path, note: Path) -> dict[str, Any] | None:
-    """The holder on another host that this host's lock, free as it is, may not know of."""
+    """A live holder on another host, of which this host's lock may not know; None if there is none."""
     holder = _read(note)
     if not holder or holder["host"] == socket.gethostname():
         return None
     try:
-        # Both times are the file system's own: the clocks of two hosts may differ.
+        # Both times are those of the file system, because the hosts' clocks may differ.
         os.utime(file)
         silent = file.stat().st_mtime - note.stat().st_mtime
     except FileNotFoundError:

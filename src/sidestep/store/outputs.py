@@ -1,4 +1,4 @@
-"""Can what a command is to write be written? Tried before anything long begins."""
+"""Test whether outputs can be written, before long work begins."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Paths = Iterable[str | Path | None]
 
 
 def try_outputs(*, files: Paths = (), new: Paths = (), folders: Paths = ()) -> None:
-    """Try to write where something will be written, and leave everything as it was.
+    """Test writing of all outputs, without changing anything.
 
-    **Arguments:** `files` written anew or in place of what is there; `new` files, never over one that exists;
-    `folders` in which files are written. None stands for an output that was not asked for. Folders that are
-    missing are made later; pipes and devices such as /dev/stdout are files that always may be written over.
+    **Arguments:** `files` that may be overwritten; `new` files, which must not exist; `folders` in which
+    files will be written. None entries are ignored. Missing folders are created later. Pipes and devices such
+    as /dev/stdout may always be overwritten.
 
-    **Raises** `OutputError` for the first of them that cannot be written, and for a file named twice.
+    **Raises** `OutputError` for the first output that cannot be written, and for a file named twice.
     """
     files, new, folders = (
         [Path(path) for path in group if path is not None] for group in (files, new, folders)
@@ -33,7 +33,7 @@ def try_outputs(*, files: Paths = (), new: Paths = (), folders: Paths = ()) -> N
     for path in (*files, *new):
         place = os.path.realpath(path)
         if place in seen and not is_stream(path):
-            raise OutputError(path, f"{path} is named for two outputs; give each a name of its own")
+            raise OutputError(path, f"{path} is named for two outputs; give them different names")
         seen.add(place)
         with writing(path):
             _try_file(path)
@@ -60,12 +60,12 @@ def _try_file(path: Path) -> None:
 
 
 def _try_stream(path: Path) -> None:
-    """Nothing at all is written, which a full or a closed device refuses already."""
+    """Write zero bytes, which a full or closed device already refuses."""
     descriptor = descriptor_of(path)
     if descriptor is not None:
         os.fstat(descriptor)
     elif path.is_fifo():
-        # To open it would wait for a reader.
+        # Opening it would wait for a reader.
         if not os.access(path, os.W_OK):
             raise OutputError(path, f"{path} is write-protected; give another name")
     else:
@@ -74,9 +74,9 @@ def _try_stream(path: Path) -> None:
 
 
 def _try_folder(named: Path, place: Path) -> None:
-    """Make what is missing on the way to `place` under another name, write there, and take it all away.
+    """Create the missing folders of `place` under another name, write there, and remove them.
 
-    Under another name, so that nobody who makes the same folder meanwhile loses it.
+    Another name is used so that a folder created meanwhile by another process is not removed.
     """
     there = place.parent
     while not there.exists() and there != there.parent:
@@ -87,7 +87,7 @@ def _try_folder(named: Path, place: Path) -> None:
     probe = Path(tempfile.mkdtemp(prefix=f"{PROBE}{os.getpid()}-", dir=there))
     try:
         (probe / missing).mkdir(parents=True, exist_ok=True)
-        # As long as the name that it is written under at first.
+        # As long as the temporary name of `whole_file`.
         with open(probe / missing / f".{place.name}.{os.getpid()}.tmp", "wb") as file:
             file.write(_PROBE)
             file.flush()

@@ -1,4 +1,4 @@
-"""The run folder: what a run leaves on disk, written so that a kill at any moment leaves a readable folder.
+"""The run folder. It is readable after a kill at any time.
 
 `config.json`, `metrics.jsonl` (one line per episode), `summary.json`, `checkpoints/`, `figures/`,
 `report.html`.
@@ -28,10 +28,10 @@ from sidestep.store.files import (
 from sidestep.store.lock import LOCK, FolderInUseError, hold, is_vacant
 
 OUTCOMES = ("captured", "collided", "reached", "timed_out")
-"""How an episode ends; exclusive, the first that applies."""
+"""The outcomes of an episode; exclusive, the first that applies."""
 
 CONVERGENCE_WINDOW = 20
-"""Episodes over which returns are averaged to tell convergence."""
+"""Number of episodes over which returns are averaged to detect convergence."""
 CONVERGENCE_RETURN = 940.0
 """Mean return that counts as converged: with +1000 for the target, at least 19 of 20 reached."""
 
@@ -40,15 +40,15 @@ _KINDS = {"run": "training", "study": "reproduction", "falsification": "search f
 
 
 NOT_BEGUN = "leave out --resume to start one there"
-"""What to do about a run that is to go on where there is none."""
+"""Advice for --resume in a folder without a run."""
 
 
 class RunError(ValueError):
-    """A run folder that cannot be used as asked; the message says what to do instead."""
+    """A run folder that cannot be used; the message says what to do instead."""
 
 
 def _read(path: Path) -> Any:
-    """A JSON file of a run. **Raises** `RunError` when it is missing or no JSON."""
+    """Read a JSON file of a run. **Raises** `RunError` when it is missing or invalid."""
     try:
         return read_json(path)
     except UnreadableError as error:
@@ -58,10 +58,10 @@ def _read(path: Path) -> Any:
 
 @contextmanager
 def writing(folder: str | Path, *inner: str, resume: bool = False) -> Iterator[None]:
-    """Hold a run folder, and the folders of these names in it, for as long as it is written; see `hold`.
+    """Lock a run folder, and the folders of these names in it, while it is written; see `hold`.
 
-    **Raises** `RunError` when there is something in a new one, or nothing to resume, before anything is
-    touched; `FolderInUseError` when another process writes there.
+    **Raises** `RunError`, before anything is changed, when a new folder is occupied or there is nothing to
+    resume; `FolderInUseError` when another process writes there.
     """
     folder = Path(folder)
     if resume:
@@ -74,14 +74,14 @@ def writing(folder: str | Path, *inner: str, resume: bool = False) -> Iterator[N
 
 
 def held_if_run(folder: str | Path) -> AbstractContextManager[None]:
-    """Hold the folder if there is a run in it, for what is added to one later; see `hold`."""
+    """Lock the folder if it holds a run, to add files to it; see `hold`."""
     return hold(folder) if (Path(folder) / _CONFIG).is_file() else nullcontext()
 
 
 def create_run(folder: str | Path, config: Mapping[str, Any]) -> Path:
-    """A new run folder with `config.json` and empty `checkpoints/` and `figures/`.
+    """Create a run folder with `config.json` and empty `checkpoints/` and `figures/`.
 
-    **Raises** `RunError` when there is anything in `folder` already: nothing is ever overwritten silently.
+    **Raises** `RunError` when `folder` is not empty: nothing is overwritten silently.
     """
     folder = Path(folder)
     _refuse_occupied(folder)
@@ -103,7 +103,7 @@ def _refuse_occupied(folder: Path) -> None:
         except FolderInUseError:
             raise
         except ValueError:
-            pass  # It cannot be written in, which is not what is wrong first.
+            pass  # Not writable; report the occupied folder instead.
     what = "a run" if (folder / _CONFIG).exists() else "files"
     raise RunError(
         f"{folder} already holds {what}, which would be overwritten; continue a run with --resume, "
@@ -112,16 +112,17 @@ def _refuse_occupied(folder: Path) -> None:
 
 
 def _is_left_by_a_kill(entry: Path) -> bool:
-    """Whether this is what is left when `create_run` is killed before `config.json` is in place."""
+    """Whether this remains from a `create_run` killed before `config.json` was written."""
     return is_vacant(entry) or (entry.name.startswith(f".{_CONFIG}.") and entry.suffix == ".tmp")
 
 
 def open_run(folder: str | Path, kind: str | None = None, *, otherwise: str = "") -> dict[str, Any]:
     """The configuration of an existing run.
 
-    **Arguments:** `kind` what it must be: `run` (a training), `study` or `falsification`; anything if None.
+    **Arguments:** `kind` required: `run` (a training), `study` or `falsification`; any if None. `otherwise`,
+    advice for the error message.
 
-    **Raises** `RunError` when `folder` holds none, or one of another kind; `otherwise` says what to do then.
+    **Raises** `RunError` when `folder` holds no run, or one of another kind.
     """
     folder, advice = Path(folder), f"; {otherwise}" if otherwise else ""
     if not (folder / _CONFIG).is_file():
@@ -140,7 +141,7 @@ def _kind_of(config: Mapping[str, Any]) -> str:
 def refuse_changes(
     folder: str | Path, stored: Mapping[str, Any], asked: Mapping[str, Any], names: Iterable[str]
 ) -> None:
-    """Compare what is asked for with what the run in `folder` was begun with (`stored`), setting by setting.
+    """Compare the settings `asked` with those `stored` in `folder`.
 
     **Raises** `RunError` with the first of `names` that differs, and both values.
     """
@@ -159,10 +160,10 @@ def refuse_changes(
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
-    """The episodes of a run in order, or the rounds of a search; none when it has no metrics yet.
+    """The episodes of a run in order, or the rounds of a search; empty without metrics.
 
-    A last line that was cut off by a kill is left out. **Raises** `RunError` naming any other line that
-    cannot be read, or is not the next of its kind.
+    A last line cut off by a kill is ignored. **Raises** `RunError` naming any other line that cannot be read,
+    or has the wrong number.
     """
     path = Path(folder) / _METRICS
     if not path.exists():
@@ -217,7 +218,7 @@ def append_metrics(folder: str | Path, episodes: Iterable[Mapping[str, Any]]) ->
 
 
 def _end_of_last_line(file: Any) -> int:
-    """Position after the last line feed, read backwards so that a long file costs nothing."""
+    """Position after the last line feed, searched backwards for speed."""
     position = file.seek(0, os.SEEK_END)
     while position > 0:
         start = max(0, position - 4096)
@@ -230,9 +231,9 @@ def _end_of_last_line(file: Any) -> int:
 
 
 def truncate_metrics(folder: str | Path, episodes: int) -> None:
-    """Keep the first `episodes` lines, for a resume from a checkpoint older than the metrics.
+    """Keep the first `episodes` lines, to resume from a checkpoint older than the metrics.
 
-    **Raises** `RunError` when there are fewer.
+    **Raises** `RunError` when there are fewer lines.
     """
     path = Path(folder) / _METRICS
     *lines, _cut = path.read_bytes().split(b"\n") if path.exists() else [b""]
@@ -242,7 +243,7 @@ def truncate_metrics(folder: str | Path, episodes: int) -> None:
 
 
 def moving_mean(values: ArrayLike, window: int = CONVERGENCE_WINDOW) -> np.ndarray:
-    """Mean of the last `window` values at each position, NaN before there are that many."""
+    """Mean of the last `window` values at each position; NaN at the first `window` - 1 positions."""
     series = np.asarray(values, dtype=float)
     means = np.full(series.shape, np.nan)
     if len(series) >= window:
@@ -251,30 +252,30 @@ def moving_mean(values: ArrayLike, window: int = CONVERGENCE_WINDOW) -> np.ndarr
 
 
 def converged_episode(returns: ArrayLike) -> int | None:
-    """First episode, from 1, that closes 20 episodes with a mean return of at least 940, if one does."""
+    """The first episode, from 1, at which the mean return of the last 20 episodes is at least 940; None if
+    there is none."""
     closed = np.flatnonzero(moving_mean(returns) >= CONVERGENCE_RETURN)
     return int(closed[0]) + 1 if len(closed) else None
 
 
 def longest_convergence(returns: ArrayLike) -> tuple[int, int] | None:
-    """First and last episode, from 1, of the longest stretch whose 20-episode means are all at least 940.
+    """First and last episode, from 1, of the longest stretch in which all 20-episode means are at least 940.
 
-    Convergence is a first crossing, and a mean may fall below again. The first of several that are equally
-    long; None when no mean is that high.
+    The mean may fall below 940 after the first convergence. Of several equally long stretches the first; None
+    if no mean is that high.
     """
     stretches = _convergences(returns)
     return max(stretches, key=lambda stretch: stretch[1] - stretch[0]) if stretches else None
 
 
 def stays_converged_from(returns: ArrayLike) -> int | None:
-    """Episode, from 1, from which all 20-episode means to the end of training are at least 940, if there is
-    one."""
+    """The episode, from 1, from which on all 20-episode means are at least 940; None if there is none."""
     stretches, last = _convergences(returns), np.size(returns)
     return stretches[-1][0] if stretches and stretches[-1][1] == last else None
 
 
 def _convergences(returns: ArrayLike) -> list[tuple[int, int]]:
-    """First and last episode of every stretch with means of at least 940, in order."""
+    """First and last episode of every stretch with 20-episode means of at least 940, in order."""
     reached = moving_mean(returns) >= CONVERGENCE_RETURN
     edges = np.flatnonzero(np.diff(np.concatenate([[False], reached, [False]]).astype(int)))
     return [(int(begin) + 1, int(end)) for begin, end in edges.reshape(-1, 2)]
@@ -283,21 +284,26 @@ def _convergences(returns: ArrayLike) -> list[tuple[int, int]]:
 def summarise(
     metrics: Sequence[Mapping[str, Any]], *, wall_seconds: float | int, **about: Any
 ) -> dict[str, Any]:
-    """`summary.json` of a run, from its episodes.
+    """The content of a run's `summary.json`, from its episodes.
 
-    **Arguments:** `metrics` as `read_metrics` returns it; `about`: `scenario`, `shield`, `pursuer`, `seed`,
-    `version`, put in as they are.
+    **Arguments:** `metrics` from `read_metrics`; `about`: `scenario`, `shield`, `pursuer`, `seed`, `version`,
+    added unchanged.
 
-    **Returns** counts per outcome, `safe_episodes` (neither captured nor collided), `env_steps` (control
-    periods simulated), `converged_episode` (a first crossing, see there), `converged_stays_from` and
-    `converged_longest` (see `stays_converged_from`, `longest_convergence`), `final_return` (mean of the last
-    20 episodes, of all if fewer),
-    the smallest clearances (m), and the shares of control periods in which the shield corrected the action
-    (`intervention_rate`), could not satisfy its rows (`infeasible_rate`) or was given numbers that are not
-    finite (`invalid_rate`), how far it changed the velocity on average over all of them
-    (`mean_correction`, m/s), and the control periods in which a pursuer's wheel speeds were not finite and it
-    stood still (`pursuer_invalid`). What needs an episode is null without one, and so are `invalid_rate` and
-    `pursuer_invalid` where episodes of an earlier version did not count those periods.
+    **Returns**
+
+    - the counts per outcome, and `safe_episodes` (neither captured nor collided)
+    - `env_steps`: control periods simulated
+    - `converged_episode`, `converged_stays_from` and `converged_longest`, see the functions
+      `converged_episode`, `stays_converged_from`, `longest_convergence`
+    - `final_return`: mean return of the last 20 episodes, of all if fewer
+    - the least clearances, m
+    - `intervention_rate`, `infeasible_rate`, `invalid_rate`: shares of control periods in which the shield
+      corrected the action, could not satisfy its rows, got non-finite input
+    - `mean_correction` over all control periods, m/s
+    - `pursuer_invalid`: control periods in which a pursuer's wheel speeds were not finite and it stood still
+
+    Entries that need an episode are null without one. `invalid_rate` and `pursuer_invalid` are null if an
+    earlier version, which did not count those periods, recorded an episode.
     """
     counts = {name: sum(episode["outcome"] == name for episode in metrics) for name in OUTCOMES}
     if sum(counts.values()) != len(metrics):
@@ -317,7 +323,7 @@ def summarise(
         count = total(key)
         return count / steps if steps and count is not None else None
 
-    # An episode's is the mean over its own periods.
+    # `mean_correction` of an episode is the mean over its periods.
     correction = sum(float(episode["mean_correction"]) * int(episode["steps"]) for episode in metrics)
     return json_safe(
         {
