@@ -1,6 +1,6 @@
 """sidestep: safe reinforcement learning for a robot that is being pursued.
 
-Everything public is importable from here and loaded when first used, so that `import sidestep` is cheap.
+All public names are importable from here and are loaded when first used, so that `import sidestep` is fast.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from sidestep import _interrupts
 
 
 def main() -> int:
-    """Run the command line; returns the exit status. Ctrl-C counts from here on, while imports run too."""
+    """Run the command line; returns the exit status. Ctrl-C is handled from here on, during imports too."""
     _interrupts.claim()
     from sidestep import cli
 

@@ -1,4 +1,4 @@
-"""What may a field hold? Declared on the field of a dataclass or module, and checked in one place."""
+"""Bounds of the fields of dataclasses and modules, with one checker for all."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _SHOWN = {math.pi / 2.0: "pi/2", 2**31 - 1: "2^31 - 1", 2**32 - 1: f"2^32 - 1, {
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """The numbers that a field takes. Called with a value, it returns a float, an int or a NumPy array.
+    """The numbers that a field accepts. Called with a value, it returns a float, an int or a NumPy array.
 
     - the range: `above` or `least`, `below` or `most`, in `unit`
-    - `whole` numbers only; their `most` is 2^31 - 1 unless given, since compiled programs count in 32 bits
-    - `shape` of an array of such numbers, None for any length; `empty`: whether it may hold none
+    - `whole` numbers only; their default `most` is 2^31 - 1, since compiled programs count in 32 bits
+    - `shape` of an array of such numbers, None for any length; `empty`: whether it may be empty
     - `infinite`: whether infinity is allowed
 
     **Raises** `ValueError` when called with anything else; `str` says what is allowed.
@@ -61,7 +61,7 @@ class Bound:
             raise ValueError
         if any(size != (wanted or size or 1) for size, wanted in zip(array.shape, self.shape, strict=True)):
             raise ValueError
-        # In the precision that will be used: 1e-60 is 0 in float32, 1e60 infinite.
+        # Checked in the precision that is used: 1e-60 is 0 in float32, 1e60 infinite.
         with np.errstate(over="ignore", under="ignore"):
             numbers = array if self.whole else array.astype(jax.dtypes.canonicalize_dtype(float))
         for number in numbers.ravel().tolist():
@@ -93,7 +93,7 @@ class Bound:
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """Values of a type, of `options` if there are any; called like a `Bound`."""
+    """Values of a type, limited to `options` if there are any; called like a `Bound`."""
 
     type: type
     words: str
@@ -115,10 +115,10 @@ def one_of(*options: str) -> Kind:
 
 _FLAG, _TEXT = Kind(bool, "true or false"), Kind(str, "text")
 SEED = Bound(least=0, most=2**32 - 1, whole=True)
-"""Of larger seeds JAX would drop the upper bits, and two seeds would silently be one."""
+"""JAX drops the upper bits of larger seeds, so that different seeds would be equal."""
 EPISODES = Bound(least=1, most=10**8, whole=True)
 SIDE_BY_SIDE = Bound(least=1, most=2**20, whole=True)
-"""Episodes that are computed at once."""
+"""Number of episodes computed at once."""
 DISTANCE = Bound(least=0.0, most=1e6, unit="m")
 HEADING_ERROR = Bound(least=0.0, below=math.pi / 2.0, unit="rad")
 DURATION = Bound(above=0.0, most=1e6)
@@ -129,25 +129,25 @@ WIND = Bound(shape=(2,), least=-100.0, most=100.0, unit="m/s")
 WORKERS = Bound(least=1, most=1024, whole=True)
 VISITORS = Bound(least=1, most=10_000, whole=True)
 SPEED_UP = Bound(least=0.01, most=1000.0)
-"""How many times faster than it was an episode is shown."""
+"""Speed of a video as a factor on real time."""
 
 
 def within(rule: Bound | Kind | None = None, **limits: Any) -> dict[str, Any]:
-    """The metadata of a field that holds what `rule` allows, or numbers with these limits, see `Bound`."""
+    """The metadata of a field limited by `rule`, or of numbers with these limits, see `Bound`."""
     return {"allowed": rule or Bound(**limits)}
 
 
 def bounded(default: Any, rule: Bound | Kind | None = None, **limits: Any) -> Any:
-    """A field as `within`, for whole numbers if the default is one: `bounded(0.2, above=0.0, unit="m/s")`."""
+    """A field with limits; for whole numbers if the default is an int. `bounded(0.2, above=0.0, unit="m/s")`."""
     metadata = within(rule, **{"whole": isinstance(default, int), **limits})
     return dataclasses.field(default=default, metadata=metadata)
 
 
 def allowed(owner: Any) -> dict[str, Any]:
-    """What each field of a dataclass may hold, a `Bound` or `Kind`: as declared, or by its default for flags
-    and texts; None for what is no number and declares nothing, and for what may be `Any`.
+    """The `Bound` or `Kind` of each field of a dataclass: as declared, or according to its default for flags
+    and texts; None for other fields without a declaration, and for fields of type `Any`.
 
-    **Raises** `TypeError` for a numeric field that declares nothing.
+    **Raises** `TypeError` for a numeric field without a declaration.
     """
     rules: dict[str, Any] = {}
     for field in dataclasses.fields(owner):
@@ -161,7 +161,7 @@ def allowed(owner: Any) -> dict[str, Any]:
 
 
 def taken(name: str, value: Any, rule: Bound | Kind, error: type[ValueError] = ValueError) -> Any:
-    """The value as it is used. **Raises** `error` that calls it `name` if `rule` does not allow it."""
+    """The value converted by `rule`. **Raises** `error`, with `name`, if `rule` does not allow it."""
     try:
         return rule(value)
     except (ValueError, TypeError):
@@ -177,12 +177,12 @@ def check(
     label: str = "{}",
     error: type[ValueError] = ValueError,
 ) -> dict[str, Any]:
-    """The values of a dataclass' fields as they are used, each checked against what its field declares.
+    """The values of a dataclass' fields, checked against the fields' bounds and converted.
 
-    **Arguments:** `owner` the class, with `values` for some of its fields; or an instance, whose own values
-    are taken. Messages start with `title` and call a field by `label`. A default of None may stay.
+    **Arguments:** `owner` the class, with `values` for some of its fields; or an instance, whose values are
+    checked. Messages start with `title` and name a field by `label`. A default of None is allowed.
 
-    **Raises** `error` naming every wrong field, its value and what is allowed; `TypeError` as `allowed`.
+    **Raises** `error` naming every invalid field, its value and what is allowed; `TypeError` as `allowed`.
     """
     optional = {field.name for field in dataclasses.fields(owner) if field.default is None}
     rules = allowed(owner)
@@ -202,6 +202,6 @@ def check(
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """What to add to a message about an unknown name: the nearest of the known ones, if any is near."""
+    """The end of a message about an unknown name: the most similar known one, if any is similar."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"; did you mean '{near[0]}'?" if near else "."

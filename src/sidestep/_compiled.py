@@ -1,4 +1,4 @@
-"""How do compiled programs run: in how many threads, and kept where for the next process?"""
+"""Threads and the cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import sys
 from pathlib import Path
 
 _LARGEST = 1 << 30
-"""Bytes; beyond that JAX deletes what was used longest ago."""
+"""Size of the cache in bytes; beyond it JAX deletes the least recently used programs."""
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def thread_limits(threads: int) -> dict[str, str]:
-    """Environment variables with which JAX, and the libraries that NumPy calls, compute in so many threads.
+    """Environment variables that limit JAX, and the libraries of NumPy, to this many threads.
 
-    They count until JAX is first used. XLA takes a thread for every core whatever its flags for Eigen say,
-    and hands even small programs round among them: a decision of `joint` takes 1.4 times as long then.
+    They have an effect until JAX is first used. Otherwise XLA uses one thread per core, independent of its
+    flags for Eigen, for small programs too: a decision of `joint` then takes 1.4 times as long.
     """
     pools = "PJRT_NPROC", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
     return dict.fromkeys(pools, str(threads))
@@ -39,10 +39,11 @@ def cache_folder() -> Path | None:
 
 
 def keep_compiled_programs() -> None:
-    """Have JAX keep on disk what takes it more than 0.3 s to compile.
+    """Enable JAX's compilation cache on disk, for programs that take more than 0.3 s to compile.
 
-    For programs to call before JAX is imported; afterwards it does nothing, so that a library's user keeps
-    what they have set. JAX's own environment variables go first. A folder that cannot be made is not used.
+    Programs must call this before JAX is imported; afterwards it does nothing, so that settings of a
+    library's user are kept. JAX's environment variables have priority. A folder that cannot be created is not
+    used.
     """
     folder = cache_folder()
     if "jax" in sys.modules or folder is None or "JAX_COMPILATION_CACHE_DIR" in os.environ:

@@ -1,15 +1,16 @@
-"""Ctrl-C: where may it end the work, and what has to happen first?
+"""Ctrl-C: handle it without losing data.
 
-Python raises `KeyboardInterrupt` between any two instructions of the main thread. There it can turn into an
-`ImportError` (while an extension module is imported), be lost (in a finalizer or a callback), or leave one
-of two things done that belong together. So a command handles SIGINT itself. From `claim` on, Ctrl-C
+Python raises `KeyboardInterrupt` between any two instructions of the main thread. That may become an
+`ImportError` (during the import of an extension module), be lost (in a finalizer or a callback), or leave
+only one of two related actions done. So a command handles SIGINT itself. After `claim`, Ctrl-C
 
-- ends the process at once with status 130, where nothing can be lost: files are written whole or not at all;
-- within `held` is acted on where the work calls `check`: between two steps, when nothing is being computed.
-  A second Ctrl-C ends the process at once there too.
+- ends the process at once with status 130, outside `held`. Nothing is lost, because files are written whole
+  or not at all;
+- takes effect at the next call of `check` within `held`, between two steps of the work. A second Ctrl-C ends
+  the process at once.
 
-Leaving at once skips Python's shutdown, which would take away memory that threads of XLA still work on.
-Library functions use `held` too; in a program that is not ours they raise `KeyboardInterrupt` at `check`.
+Ending at once skips Python's shutdown, which would free memory that threads of XLA still use. Library
+functions use `held` too; without `claim` they raise `KeyboardInterrupt` at `check`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from types import FrameType
 from typing import NoReturn
 
 STATUS = 130
-"""Exit status of a command that Ctrl-C ended: 128 plus the number of SIGINT, as shells have it."""
+"""Exit status of a command ended by Ctrl-C: 128 plus the number of SIGINT, as in shells."""
 _SHOW_CURSOR = "\x1b[?25h"
 
 _claimed = False
@@ -35,10 +36,10 @@ _actions: list[Callable[[], object]] = []
 
 
 def claim() -> None:
-    """From here on Ctrl-C ends this process at once, outside `held`.
+    """Make Ctrl-C end this process at once, outside `held`.
 
-    For a program's entry point, before it imports anything heavy. Does nothing where SIGINT is ignored, as in
-    a shell's background jobs, or handled already.
+    For a program's entry point, before heavy imports. Does nothing if SIGINT is ignored, as in background
+    jobs of a shell, or already handled.
     """
     global _claimed
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -48,10 +49,10 @@ def claim() -> None:
 
 @contextlib.contextmanager
 def held() -> Iterator[None]:
-    """Within, the first Ctrl-C waits for `check`; a second one acts at once.
+    """A context in which the first Ctrl-C waits for `check`; a second one ends the process at once.
 
-    A first one that no `check` has answered raises `KeyboardInterrupt` at the end. Does nothing outside the
-    main thread, and where the program handles SIGINT in another way.
+    If no `check` follows the first one, `KeyboardInterrupt` is raised at the end. Does nothing outside the
+    main thread, and if the program handles SIGINT in another way.
     """
     global _depth, _asked, _answered
     ours = signal.getsignal(signal.SIGINT) in (_heard, signal.default_int_handler)
@@ -82,9 +83,10 @@ def check() -> None:
 
 @contextlib.contextmanager
 def before_leaving(action: Callable[[], object]) -> Iterator[None]:
-    """Within, `action()` is called before Ctrl-C ends a command at once, the latest `action` first.
+    """A context in which `action()` is called before Ctrl-C ends a command at once, the latest `action`
+    first.
 
-    It runs inside a signal handler: it must be short and wait for no lock. What it raises is ignored.
+    It runs in a signal handler: it must be short and must not wait for a lock. Its exceptions are ignored.
     """
     _actions.append(action)
     try:
@@ -94,7 +96,7 @@ def before_leaving(action: Callable[[], object]) -> Iterator[None]:
 
 
 def say(line: str) -> None:
-    """Print a line from inside a signal handler, where Python's own streams may be in use."""
+    """Print a line from a signal handler, in which Python's streams may be in use."""
     with contextlib.suppress(Exception):
         sys.stdout.flush()
     with contextlib.suppress(OSError):
@@ -114,7 +116,7 @@ def _heard(signal_number: int, frame: FrameType | None) -> None:
 
 
 def _leave() -> NoReturn:
-    # One more is not to wait for whoever reads what is flushed below.
+    # Another Ctrl-C must not wait for the reader of the output flushed below.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     with contextlib.suppress(Exception):
         if sys.stderr.isatty():

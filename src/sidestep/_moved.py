@@ -1,4 +1,4 @@
-"""Names that have moved: the old one still works for one release, and says where it is now."""
+"""Moved names: the old name works for one release, with a warning that names the new module."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _WRAPPERS = ("equinox", "jaxtyping", "importlib")
 
 
 def moved_names(old: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """A module's `__getattr__` for names that are in other modules now.
+    """A module's `__getattr__` for names that were moved to other modules.
 
-    **Arguments:** `old` the module's own name, `names` the module that each name is in now.
+    **Arguments:** `old` the module's name, `names` the new module of each name.
 
     The function warns `DeprecationWarning` at the line that uses the old name.
     """
@@ -31,7 +31,7 @@ def moved_names(old: str, names: Mapping[str, str]) -> Callable[[str], Any]:
 
 
 def moved_module(old: str, new: str) -> Callable[[str], Any]:
-    """The same for a module all of whose names are in the module `new` now."""
+    """As `moved_names`, for a module whose names were all moved to the module `new`."""
 
     def find(name: str) -> Any:
         if name.startswith("__"):
@@ -52,10 +52,10 @@ def renamed(function: Callable[..., Any], old: str) -> Callable[..., Any]:
 
 
 def renamed_methods(subclass: type, names: Mapping[str, str]) -> None:
-    """For the `__init_subclass__` of a base class whose methods have other names now.
+    """For the `__init_subclass__` of a base class whose methods were renamed.
 
-    A subclass that still defines an old one warns `DeprecationWarning` and has the new one too. One that
-    defines a new one has the old one as `renamed`.
+    A subclass that defines an old name warns `DeprecationWarning` and also gets the new one. A subclass that
+    defines a new name also gets the old one, see `renamed`.
 
     **Arguments:** `names` old to new.
     """
@@ -71,7 +71,7 @@ def renamed_methods(subclass: type, names: Mapping[str, str]) -> None:
 
 
 def renamed_arguments(**names: str) -> Callable[[_Class], _Class]:
-    """Decorates a class whose fields have other names now: the old keyword still works, and warns."""
+    """Decorate a class whose fields were renamed: the old keyword still works, with a warning."""
 
     def decorate(decorated: _Class) -> _Class:
         begin: Callable[..., None] = decorated.__init__

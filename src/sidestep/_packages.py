@@ -1,7 +1,7 @@
-"""Which packages of an extra are missing, and which command installs them from where the user is?
+"""Missing packages of an extra, and the command that installs them.
 
-`sidestep` is on no public index, so its bare name with an extra finds nothing there: the advice names what
-this `sidestep` was installed from, and the Python that runs it.
+`sidestep` is not on a public index, so `sidestep[extra]` cannot be installed by name. The advice names the
+source from which this `sidestep` was installed, and the Python that runs it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 from sidestep import _program
 
 TORCH = "torch==2.13.0"
-"""Goes first and in one exact version: benchmarks/README.md says why."""
+"""Must be installed first, in this exact version, see benchmarks/README.md."""
 
 
 def needed(name: str, extra: str, what: str, error: type[Exception] = ValueError) -> Any:
@@ -37,17 +37,17 @@ def needed(name: str, extra: str, what: str, error: type[Exception] = ValueError
 
 
 def install_extra(extra: str) -> str:
-    """A line to paste into a POSIX shell that installs the extra `extra` into this environment.
+    """A line for a POSIX shell that installs the extra `extra` into this environment.
 
-    From the clone, folder, wheel file or address that `sidestep` was installed from. Where that is gone or
-    not recorded, the line names the packages of the extra themselves, which are on the public index.
+    It uses the clone, folder, wheel file or address from which `sidestep` was installed. If that is gone or
+    not recorded, it names the packages of the extra, which are on the public index.
     """
     source = _source(extra)
     return install(*source) if source else install(*_packages_of(extra))
 
 
 def install(*requirements: str) -> str:
-    """A line to paste into a POSIX shell that installs the requirements into this environment.
+    """A line for a POSIX shell that installs the requirements into this environment.
 
     With pip, else with uv (an environment made by uv has no pip), else with pip after ensurepip.
     """
@@ -61,7 +61,7 @@ def install(*requirements: str) -> str:
 
 
 def _source(extra: str) -> list[str]:
-    """What pip takes to install this `sidestep` again with the extra; empty where that is not known."""
+    """pip's arguments that install this `sidestep` with the extra; empty if unknown."""
     try:
         text = importlib.metadata.distribution("sidestep").read_text("direct_url.json")
     except importlib.metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""How is this program called, from where the user is? For advice that works when it is pasted."""
+"""The command lines in advice, so that they work when pasted."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathlib import Path
 
 
 def command(*words: object) -> str:
-    """A `sidestep` command line to paste into a POSIX shell: `command("report", "my run")`.
+    """A `sidestep` command line for a POSIX shell: `command("report", "my run")`.
 
-    **Arguments:** `words` what follows the program's name; each is quoted where a shell needs it.
+    **Arguments:** `words` after the program's name, which are quoted if necessary.
     """
     return " ".join([*program(), *(shlex.quote(str(word)) for word in words)])
 
 
 def program() -> list[str]:
-    """The quoted words that start `sidestep` in the shell and folder this process was started from.
+    """The quoted words that start `sidestep` in this process's shell and folder.
 
-    The bare name where the PATH leads to this environment's script, else that script's path, else this
-    Python with `-m sidestep`.
+    The bare name if the PATH leads to this environment's script, else that script's path, else this Python
+    with `-m sidestep`.
     """
     script = Path(sys.executable).parent / "sidestep"
     found = shutil.which("sidestep")
@@ -36,7 +36,7 @@ def python() -> str:
     """The running Python, quoted for a POSIX shell: `python` where the PATH leads to it, else its path."""
     running = Path(sys.executable)
     found = shutil.which("python")
-    # Not the files themselves: those of all environments are links to one.
+    # Compare paths and not files, because all environments link to one file.
     if found is not None and Path(found).parent.resolve() == running.parent.resolve():
         return "python"
     return shlex.quote(_seen_from_here(running))

@@ -1,7 +1,7 @@
 """Several threads for one computation.
 
-On a CPU, JAX runs what a thread asks for one after the other, and a program of many small loops in one core.
-What different threads ask for runs side by side.
+On a CPU, JAX runs the programs of one thread in sequence, and a program of many small loops on one core. The
+programs of different threads run in parallel.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ T = TypeVar("T")
 
 
 def allowed_threads() -> int:
-    """One for each core that this process may use; fewer where `PJRT_NPROC` allows JAX fewer."""
-    told = os.environ.get("PJRT_NPROC", "")
-    return min(cores(), int(told)) if told.isdigit() and int(told) > 0 else cores()
+    """One thread per core that this process may use; fewer if `PJRT_NPROC` limits JAX."""
+    limit = os.environ.get("PJRT_NPROC", "")
+    return min(cores(), int(limit)) if limit.isdigit() and int(limit) > 0 else cores()
 
 
 def useful_threads(most: int) -> int:
-    """How many threads, at most so many, one computation is best shared among.
+    """The best number of threads for one computation, at most `most`.
 
-    One where an accelerator computes, and where JAX's settings hold for this thread only, as those of
-    `with jax.enable_x64(True)` do.
+    One on an accelerator, and if JAX's settings hold for this thread only, such as those of
+    `with jax.enable_x64(True)`.
     """
     count = min(allowed_threads(), most)
     if count <= 1 or jax.default_backend() != "cpu":
@@ -53,35 +53,36 @@ def _settings() -> tuple[object, ...]:
 
 
 def side_by_side(works: Sequence[Iterable[T]], tell: Callable[[T], None]) -> None:
-    """Go through all iterables, each in a thread of its own; `tell` gets in this thread what they yield.
+    """Iterate over all iterables, each in a separate thread; `tell` is called in this thread with their
+    items.
 
-    As soon as one of them, or `tell`, raises, or Ctrl-C is pressed, the others end after what they are at.
-    A single one is gone through in this thread.
+    When one of them or `tell` raises, or Ctrl-C is pressed, the others end after their current item. A single
+    iterable runs in this thread.
     """
     if len(works) == 1:
         for one in works[0]:
             tell(one)
         return
-    stop, told = threading.Event(), queue.SimpleQueue[tuple[T] | None]()
+    stop, items = threading.Event(), queue.SimpleQueue[tuple[T] | None]()
 
     def go_through(work: Iterable[T]) -> None:
         try:
             for one in work:
-                told.put((one,))
+                items.put((one,))
                 if stop.is_set():
                     break
         except BaseException:
             stop.set()
             raise
         finally:
-            told.put(None)
+            items.put(None)
 
     with ThreadPoolExecutor(len(works)) as pool:
         threads = [pool.submit(go_through, work) for work in works]
         try:
             running = len(works)
             while running:
-                if (one := told.get()) is None:
+                if (one := items.get()) is None:
                     running -= 1
                 else:
                     tell(*one)

@@ -1,3 +1,3 @@
-"""The version of this package, below all rooms, so that they can write it down."""
+"""The version of this package."""
 
 __version__ = "0.1.0"

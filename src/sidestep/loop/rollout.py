@@ -28,7 +28,7 @@ from sidestep.store.runs import OUTCOMES
 from sidestep.world import Events, Scenario, World, load_scenario, scenario_to_dict
 from sidestep.world.state import worlds_of
 
-_TOLD = "told"
+_METADATA = "told"
 
 
 class Trajectory(eqx.Module):
@@ -169,8 +169,8 @@ def save_trajectory(
     buffer = BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(trajectory).items()}
     if scenario is not None:
-        told = json_safe({"scenario": scenario_to_dict(scenario), "about": about or {}})
-        arrays[_TOLD] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+        metadata = json_safe({"scenario": scenario_to_dict(scenario), "about": about or {}})
+        arrays[_METADATA] = np.frombuffer(json.dumps(metadata).encode(), np.uint8)
     np.savez_compressed(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
 
@@ -190,8 +190,8 @@ def load_episode(path: str | Path) -> Recording:
     """Read a file of `save_trajectory`, with its scenario and metadata. **Raises** as `load_trajectory`."""
     try:
         with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
-            arrays = {name: jnp.asarray(archive[name]) for name in archive.files if name != _TOLD}
-            told = json.loads(bytes(archive[_TOLD])) if _TOLD in archive.files else {}
+            arrays = {name: jnp.asarray(archive[name]) for name in archive.files if name != _METADATA}
+            metadata = json.loads(bytes(archive[_METADATA])) if _METADATA in archive.files else {}
         places = {name: arrays.pop(name) for name in list(arrays) if name.startswith("worlds.")}
         events = {name: arrays.pop(name) for name in list(arrays) if name.startswith("events.")}
         trajectory = Trajectory(
@@ -201,7 +201,7 @@ def load_episode(path: str | Path) -> Recording:
         )
         # Custom robots without a name are code, which a recording does not need. Robots with a name are kept,
         # because the sets in figures depend on them.
-        scenario = load_scenario("paper", **_without_code(told["scenario"])) if told else None
-        return Recording(trajectory, scenario, told.get("about", {}))
+        scenario = load_scenario("paper", **_without_code(metadata["scenario"])) if metadata else None
+        return Recording(trajectory, scenario, metadata.get("about", {}))
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} holds no recorded trajectory: {error}") from error
