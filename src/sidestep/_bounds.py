@@ -138,7 +138,7 @@ def within(rule: Bound | Kind | None = None, **limits: Any) -> dict[str, Any]:
 
 
 def bounded(default: Any, rule: Bound | Kind | None = None, **limits: Any) -> Any:
-    """A field with limits; for whole numbers if the default is an int. `bounded(0.2, above=0.0, unit="m/s")`."""
+    """A field with limits: `bounded(0.2, above=0.0, unit="m/s")`. With an int default, for whole numbers."""
     metadata = within(rule, **{"whole": isinstance(default, int), **limits})
     return dataclasses.field(default=default, metadata=metadata)
 

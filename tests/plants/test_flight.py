@@ -257,7 +257,7 @@ def test_airframes_that_cannot_fly_are_named(scene):
 def test_scenarios_without_a_quadrotor_are_refused(scene):
     with pytest.raises(TwinError, match="has no quadrotor: use the preset 'quadrotor'"):
         Pilot(load_scenario("paper-test"))
-    with pytest.raises(TwinError, match="differential drive after a quadrotor"):
+    with pytest.raises(TwinError, match="differential drive pursue a quadrotor"):
         Pilot(load_scenario("quadrotor-test", pursuer_model=None, pursuer_half_axle=0.2))
     with pytest.raises(ValueError, match="needs a shield of its control point"):
         Pilot(scene, shield=make_shield("none", load_scenario("paper-test")))
