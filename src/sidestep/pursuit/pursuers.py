@@ -128,7 +128,7 @@ class TurnThenDrive(Pursuer):
 
 @final
 class TurnWhileDriving(Pursuer):
-    """Always drives forward: turns towards the evader on arcs whose centre is at most the inner wheel."""
+    """Always drives forward: turns towards the evader on arcs about its inner wheel, or wider ones."""
 
     takes_lanes = True
     always_finite = True

@@ -20,7 +20,7 @@ _HAZARDS = (
 )
 _TICKS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0)
 _BINS_PER_ROOT = 24
-"""Number of bins on a square-root scale, which resolves both millimetres and metres."""
+"""Bins per square root of a metre. The square-root scale resolves both millimetres and metres."""
 
 
 def clearance_figure(

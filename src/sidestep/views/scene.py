@@ -98,7 +98,7 @@ def world_at(trajectory: Trajectory, period: int) -> World:
 
 def tightest_period(trajectory: Trajectory) -> int:
     """The control period at whose beginning the sum of the least barriers towards pursuers and towards
-    obstacles is smallest; the last one if the evader was lost."""
+    obstacles is smallest; `trajectory.length`, the end, if the evader was lost."""
     if trajectory.outcome in ("captured", "collided"):
         return trajectory.length
     values = np.nan_to_num(np.asarray(trajectory.barriers), neginf=0.0)

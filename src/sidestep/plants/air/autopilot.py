@@ -41,7 +41,7 @@ class Gains:
     - `velocity` 1/s: acceleration per velocity error; `integral` 1/s^2 of that error, against drag and wind,
       limited to `integral_limit` m/s^2
     - `attitude` 1/s^2 and `rates` 1/s: angular acceleration per attitude error and per rate error in roll and
-      pitch; in yaw a third of the first, and the second
+      pitch; in yaw a third of the first and all of the second
     - `largest_tilt` rad: limit of the thrust's tilt
     """
 
