@@ -167,7 +167,7 @@ class Concrete(Obedient):
 @pytest.mark.parametrize(
     "model, words",
     [
-        (Understating(), r"seen 0\.02 m from the robot, offset\(\.\.\.\) says 0\.01 m"),
+        (Understating(), r"was 0\.02 m from the robot, but offset\(\.\.\.\) is 0\.01 m"),
         (Timeless(), "over one period and over four parts"),
         (Broken(), "not finite"),
         (Misshapen(), r"must give an EvaderState of the shapes"),
