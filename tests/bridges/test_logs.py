@@ -177,7 +177,7 @@ def test_log_of_a_robot_becomes_an_episode_and_says_what_was_worked_out(tmp_path
     assert trajectory.length in (59, 60)
     assert log.about["source"] == "node"
     words = " ".join(log.rebuilt)
-    for missing in ("events", "velocity of obstacle 0", "velocity that the evader drove"):
+    for missing in ("events", "velocity of obstacle 0", "evader's velocity"):
         assert missing in words
     np.testing.assert_allclose(trajectory.action, np.tile([[0.05, 0.01]], (trajectory.length, 1)), atol=1e-7)
     # As of the last pose before each decision.
@@ -189,9 +189,9 @@ def test_log_of_a_robot_becomes_an_episode_and_says_what_was_worked_out(tmp_path
     np.testing.assert_allclose(trajectory.events.pursuer_clearance, clearance, atol=1e-6)
     assert np.all(np.asarray(trajectory.status) == Status.CORRECTED)
     read = read_log(tmp_path / "robot.mcap")
-    told = read.topics["/diagnostics"][0][1].status[0]
-    assert told.message == "corrected, degraded; late cycle"
-    assert told.level == 1
+    status = read.topics["/diagnostics"][0][1].status[0]
+    assert status.message == "corrected, degraded; late cycle"
+    assert status.level == 1
 
 
 def test_decision_of_the_core_is_logged_as_it_is(tmp_path):

@@ -43,7 +43,7 @@ def test_an_actor_that_answers_nan_is_invalid_input_in_training_too_not_a_stop(s
     assert np.all(invalid > 0)
     # The robots went on moving with finite numbers.
     assert np.all(np.isfinite(after.episode.world.evader))
-    assert divergence(report, after.learner, 3) == (4, "the action that the actor asked for is")
+    assert divergence(report, after.learner, 3) == (4, "the actor's action is")
 
 
 def test_training_whose_networks_break_stops_and_keeps_the_last_good_checkpoint(small, tmp_path):
@@ -106,7 +106,7 @@ def test_divergence_names_the_first_thing_and_the_episode_it_happened_in(small, 
     loss = [0.0, 0.0, 0.0, np.inf, np.nan, np.nan]
     assert divergence(report_of(ended, loss), learner, 7) == (9, "the critics' loss is")
     first = report_of(ended, loss, [True, True, True, False, False, False])
-    assert divergence(first, learner, 7) == (9, "the action that the actor asked for is")
+    assert divergence(first, learner, 7) == (9, "the actor's action is")
     # An episode's own last decision belongs to it.
     loss = [0.0, *[np.nan] * 5]
     assert divergence(report_of(ended, loss), learner, 0)[0] == 1

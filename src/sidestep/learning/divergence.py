@@ -98,7 +98,7 @@ def divergence(report: Report, learner: Learner, done: int) -> tuple[int, str] |
     **Arguments:** `report` of a chunk of decisions, `learner` at its end, `done` episodes before it.
     """
     signs = {
-        "the action that the actor asked for is": np.asarray(report.finite),
+        "the actor's action is": np.asarray(report.finite),
         "the critics' loss is": np.isfinite(np.asarray(report.losses.critic)),
         "the actor's loss is": np.isfinite(np.asarray(report.losses.actor)),
         "the critics' mean value is": np.isfinite(np.asarray(report.losses.value)),

@@ -68,7 +68,7 @@ class Store:
             )
         for folder in ("results", "runs", "locks"):
             make_folder(self.folder / folder)
-        # Not `runs`: there workers write, perhaps on another host, whose processes nobody knows here.
+        # Not `runs`, in which workers write, perhaps on another host, whose processes are unknown here.
         sweep(self.folder, below=False)
         sweep(self.folder / "results")
         write_bytes(self.folder / "campaign.toml", text.encode())

@@ -271,8 +271,8 @@ class _Dispatch:
         if future.status in ("cancelled", "lost"):
             raise SchedulerLostError
         if future.status == "finished":
-            # Most workers wrote the result themselves. Waiting for one that died with an unsaved result
-            # for without end: nobody else may run that task.
+            # Most workers wrote the result themselves. Waiting for a worker that died with an unsaved result
+            # would never end, because no other worker may run its task.
             if self.store.read(job.id) is None:
                 try:
                     self.store.keep(future.result(timeout=_RESULT_SECONDS))

@@ -127,7 +127,7 @@ def load_log(path: str | Path, scenario: Scenario | None = None) -> Log:
     nominal = _vectors(record, "/cmd_vel_nominal", times[:-1])
     action = _vectors(record, "/cmd_vel", times[:-1])
     if np.isnan(nominal).all():
-        rebuilt.append("nominal velocities: those that were driven")
+        rebuilt.append("nominal velocities: the executed ones")
         nominal = action
     trajectory = Trajectory(
         worlds=worlds_of(worlds),
@@ -203,11 +203,11 @@ def _worlds(
             rebuilt.append(f"the velocity of obstacle {i}: from its poses")
     velocity = _vectors(record, "/evader/velocity", times)
     if np.isnan(velocity).any():
-        rebuilt.append("the velocity that the evader drove: from its poses")
+        rebuilt.append("the evader's velocity: from its poses")
         velocity = _change(evader, times)
     target = _poses(record, "/target", times)[:, :2]
     if np.isnan(target).any():
-        rebuilt.append("the target: where the evader came to")
+        rebuilt.append("the target: the evader's last position")
         target = np.broadcast_to(evader[-1], evader.shape)
     wheels = np.stack([_wheels(record, f"/pursuer_{i}/driven", times) for i in range(m)], axis=1)
     worlds = {
@@ -244,7 +244,7 @@ def _shield_numbers(
 ) -> dict[str, Any]:
     messages = _numbers(record, "/shield", times)
     if not any(messages):
-        rebuilt.append("what the shield said: not known")
+        rebuilt.append("the shield's answers: not known")
     count = scenario.pursuer_count + scenario.obstacle_count
 
     def column(name: str, otherwise: float) -> Any:
