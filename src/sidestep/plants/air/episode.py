@@ -111,7 +111,7 @@ class Pilot(Robot):
 
     def reset(self) -> None:
         self.onboard.reset()
-        self._count, self._wish = 0, np.zeros(2)
+        self._count, self._nominal = 0, np.zeros(2)
 
     def decide(self, plant: Flight) -> Decision:
         now = plant.time
@@ -119,9 +119,9 @@ class Pilot(Robot):
         self.onboard.see("evader", now, (*plant.control_point, 0.0), now=now)
         seen = self.onboard.world(now)
         if seen is not None and self._count % self._every == 0:
-            self._wish = np.asarray(self._decide(self._known(plant, seen)), float)
+            self._nominal = np.asarray(self._decide(self._known(plant, seen)), float)
         self._count += 1
-        self.onboard.nominal(now, self._wish)
+        self.onboard.nominal(now, self._nominal)
         return self.onboard.decide(now)
 
     def _known(self, flight: Flight, seen: World) -> World:
