@@ -16,6 +16,7 @@ from sidestep.plants.air.autopilot import Gains
 from sidestep.plants.ground import Sensors, TwinOptions
 from sidestep.robot import OnboardSettings
 from sidestep.safety import Budget
+from sidestep.safety.clearance import ClearanceGame, Resolution
 from sidestep.trials.falsification import Plan
 from sidestep.views.play import Hosting, Limits
 from sidestep.views.play.sliders import SLIDERS
@@ -24,7 +25,7 @@ from sidestep.world.flyers import Aircraft, Quadrotor
 
 CLASSES = [
     Scenario, Quadrotor, Aircraft, TD3, TrainingOptions, Budget, Sensors, TwinOptions, FlightOptions,
-    Airframe, Gains, OnboardSettings, Plan, Hosting, Limits, Video, *_RUN,
+    Airframe, Gains, OnboardSettings, Plan, Hosting, Limits, Video, ClearanceGame, Resolution, *_RUN,
 ]  # fmt: skip
 
 
@@ -32,7 +33,7 @@ CLASSES = [
 def test_every_number_of_every_class_says_what_it_may_be(owner):
     for field in dataclasses.fields(owner):
         rule = allowed(owner)[field.name]
-        if isinstance(rule, Bound) and field.default is not None:
+        if isinstance(rule, Bound) and field.default not in (None, dataclasses.MISSING):
             rule(field.default)
         if isinstance(rule, Bound):
             for value in (math.nan, -math.inf, "1", True, {}):

@@ -68,8 +68,8 @@ def test_robots_against_which_the_pursuer_wins_are_warned_of_once(scenario):
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["falsify", "--shield", "game", "--out", "{}/falsify"], "the falsifier knows"),
-        (["play"], "the page knows"),
+        (["falsify", "--shield", "game", "--out", "{}/falsify"], "the falsifier supports"),
+        (["play"], "the page supports"),
         (["twin"], "`sidestep fly` flies a quadrotor"),
     ],
 )

@@ -2,6 +2,7 @@
 solution lost to an interrupt."""
 
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -159,11 +160,20 @@ def test_an_interrupted_solution_goes_on_and_ends_the_same(solution, tmp_path, m
 def test_a_scenario_names_its_game_and_one_without_a_table_is_refused():
     game = ClearanceGame.of(load_scenario("paper", capture_distance=0.15))
     assert game.obstacle_speed == pytest.approx(0.02)
-    assert math.degrees(game.angle) == pytest.approx(43.5, abs=1.0)
+    assert math.degrees(game.angle) == pytest.approx(39.5, abs=0.5)
+    assert len(game.velocities(48)) == 49
+    driving = ClearanceGame.of(load_scenario("paper", capture_distance=0.15, action="heading"))
+    assert len(driving.velocities(48)) == 48
     with pytest.raises(ValueError, match=r"no design angle keeps the pursuer 0\.2 m away"):
         ClearanceGame.of(load_scenario("paper"))
     with pytest.raises(ValueError, match="no velocity keeps the pursuit barrier"):
         solve(ClearanceGame(0.1574, 0.2, 0.2, 0.2, 0.2, 0.02, 0.05, math.radians(44.0)), COARSE)
+    with pytest.raises(ValueError, match=r"resolution: growth = 1\.0: it must be"):
+        solve(GAME, Resolution(growth=1.0))
+    with pytest.raises(ValueError, match="angles = 99: it must be even"):
+        solve(GAME, Resolution(angles=99))
+    with pytest.raises(ValueError, match=r"clearance game: .*half_axle = nan"):
+        solve(replace(GAME, half_axle=math.nan), COARSE)
 
 
 def test_derivatives_are_those_of_the_cell(table):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._bounds import within
 from sidestep.safety.certificate.sampled_design import COARSE, best_angle
 from sidestep.safety.certificate.sampled_game import SampledGame
 from sidestep.world import Scenario
@@ -20,17 +21,18 @@ class ClearanceGame:
     The evader (`evader_speed` v_e, holonomic) decides once per `control_period` T; the pursuer (rim speed V,
     `half_axle` b) must stay at least `capture_distance` l away, the obstacle, which drifts at up to
     `obstacle_speed` v_c in any direction, at least `collision_distance` d. `angle` S' > S is the design angle
-    of the set that the evader keeps from the pursuer.
+    of the set that the evader keeps from the pursuer; whether it `can_stop`, or always drives at full speed.
     """
 
-    evader_speed: float
-    pursuer_speed: float
-    half_axle: float
-    capture_distance: float
-    collision_distance: float
-    obstacle_speed: float
-    control_period: float
-    angle: float
+    evader_speed: float = field(metadata=within(above=0.0, most=1e3, unit="m/s"))
+    pursuer_speed: float = field(metadata=within(above=0.0, most=1e3, unit="m/s"))
+    half_axle: float = field(metadata=within(above=0.0, most=1e3, unit="m"))
+    capture_distance: float = field(metadata=within(above=0.0, most=1e3, unit="m"))
+    collision_distance: float = field(metadata=within(above=0.0, most=1e3, unit="m"))
+    obstacle_speed: float = field(metadata=within(least=0.0, most=1e3, unit="m/s"))
+    control_period: float = field(metadata=within(above=0.0, most=100.0, unit="s"))
+    angle: float = field(metadata=within(above=0.0, below=math.pi / 2.0, unit="rad"))
+    can_stop: bool = True
 
     @staticmethod
     def of(
@@ -38,7 +40,8 @@ class ClearanceGame:
     ) -> ClearanceGame:
         """That of a scenario.
 
-        **Arguments:** `angle` S' (rad), by default that with the most slack against the pursuer alone;
+        **Arguments:** `angle` S' (rad), by default a quarter of the way from S to that with the most slack
+        against the pursuer alone: a wider one shortens what is lost per period and lengthens the tip;
         `obstacle_speed` (m/s) for more than the scenario's own drift.
 
         **Raises** `ValueError` where no angle lets the evader keep the capture distance at this period.
@@ -56,6 +59,7 @@ class ClearanceGame:
             obstacle_speed=drift if obstacle_speed is None else obstacle_speed,
             control_period=float(scenario.control_period),
             angle=angle,
+            can_stop=scenario.action == "velocity",
         )
 
     @property
@@ -65,12 +69,12 @@ class ClearanceGame:
 
     def velocities(self, headings: int) -> Float[np.ndarray, "n 2"]:
         """What the evader chooses from, m/s: full speed in evenly spread headings, those along the tip's
-        normals exactly, and a stop."""
+        normals exactly, and a stop if it can."""
         heading = 2.0 * math.pi * np.arange(headings) / headings
         for normal in (self.angle, math.pi - self.angle, math.pi + self.angle, 2.0 * math.pi - self.angle):
             heading[np.argmin(np.abs(heading - normal))] = normal
         full = self.evader_speed * np.stack([np.cos(heading), np.sin(heading)], -1)
-        return np.concatenate([full, np.zeros((1, 2))])
+        return np.concatenate([full, np.zeros((int(self.can_stop), 2))])
 
     def motions(self, turns: int, drives: int) -> Float[np.ndarray, "n 3"]:
         """Poses (m, m, rad) that the pursuer can reach in one period: the edge of what it reaches.
@@ -99,10 +103,10 @@ def _best_angle(scenario: Scenario) -> float:
         float(scenario.control_period),
     )
     level = float(scenario.capture_distance)
-    angle, slack = best_angle(game, level, COARSE)
+    widest, slack = best_angle(game, level, COARSE)
     if not slack >= 0.0:
         raise ValueError(
             f"no design angle keeps the pursuer {level:g} m away at a period of {game.control_period:g} s "
             "for ever, so there is no clearance table; `sidestep certify` shows what would do"
         )
-    return angle
+    return game.usable_angle + 0.25 * (widest - game.usable_angle)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sidestep._bounds import bounded, check
 from sidestep._packages import needed
 from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Place, Spacing
@@ -33,17 +34,17 @@ class Resolution:
     `turns` and `drives` of the pursuer's motions, see `ClearanceGame.motions`.
     """
 
-    height: float = 0.001
-    growth: float = 1.15
-    farthest: float = 0.4
-    share: float = 0.004
-    share_growth: float = 1.25
-    bearings: int = 20
-    angles: int = 144
-    ridge: float = math.radians(0.8)
-    headings: int = 48
-    turns: int = 6
-    drives: int = 2
+    height: float = bounded(0.001, above=0.0, most=1.0, unit="m")
+    growth: float = bounded(1.15, above=1.0, most=10.0)
+    farthest: float = bounded(0.4, above=0.0, most=1e3, unit="m")
+    share: float = bounded(0.004, above=0.0, most=0.5)
+    share_growth: float = bounded(1.25, above=1.0, most=10.0)
+    bearings: int = bounded(20, least=1, most=1000)
+    angles: int = bounded(144, least=8, most=4096)
+    ridge: float = bounded(math.radians(0.8), above=0.0, most=1.0, unit="rad")
+    headings: int = bounded(48, least=8, most=4096)
+    turns: int = bounded(6, least=1, most=1000)
+    drives: int = bounded(2, least=2, most=100)
 
     def grid(self, game: ClearanceGame) -> Grid:
         """The nodes for a game."""
@@ -267,11 +268,15 @@ def solve(
     every larger clearance; `tolerance` (m) of a sweep's change at which it ends; `begun`, a solution on the
     way, to go on from, with the same result; `progress` is called with each one.
 
-    **Raises** `ValueError` where Numba is not installed, and where from some node no velocity keeps the
-    pursuit barrier: the design angle does not suit the capture distance and the period.
+    **Raises** `ValueError` for a bad number, where Numba is not installed, and where from some node no
+    velocity keeps the pursuit barrier: the design angle does not suit the capture distance and the period.
     """
-    needed("numba", "clearance", "solving for a clearance table needs", ValueError)
     resolution = Resolution() if resolution is None else resolution
+    check(game, title="clearance game: ")
+    check(resolution, title="resolution: ")
+    if resolution.angles % 2:
+        raise ValueError(f"resolution: angles = {resolution.angles}: it must be even")
+    needed("numba", "clearance", "solving for a clearance table needs", ValueError)
     solution = _start(game, _ROUGH.grid(game), _ROUGH.directions(even=True)) if begun is None else begun
     for stage, (how, least) in enumerate(((_ROUGH, 1e-4), (resolution, 1e-4), (resolution, tolerance))):
         if stage < solution.stage:
