@@ -152,7 +152,9 @@ def train(
     `OutputError` when the run cannot be written any more; `Diverged` when networks, losses or actions are not
     finite. After the last two the newest checkpoint is kept, and the run can be resumed from it.
     """
-    whole_number("episodes", episodes), whole_number("chunk", chunk), seed_number(seed)
+    whole_number("episodes", episodes)
+    whole_number("chunk", chunk)
+    seed_number(seed)
     options = make_options() if options is None else options
     names = {"shield": _name(shield), "pursuer": _name(pursuer)}
     shield, pursuer = as_shield(shield, scenario), as_pursuer(pursuer)

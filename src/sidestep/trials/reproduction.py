@@ -157,7 +157,8 @@ def reproduce(
     """
     scenario = load_scenario("paper") if scenario is None else scenario
     options = make_options() if options is None else options
-    seed_number(seed), whole_number("episodes", episodes)
+    seed_number(seed)
+    whole_number("episodes", episodes)
     whole_number("evaluation_episodes", evaluation_episodes)
     make_pursuer(pursuer)
     for shield in shields:
