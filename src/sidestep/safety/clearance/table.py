@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import time
@@ -16,7 +15,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sidestep import _interrupts
@@ -24,8 +22,9 @@ from sidestep._arrays import AnyArray, Scalar
 from sidestep._compiled import cache_folder
 from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Spacing
-from sidestep.safety.clearance.solve import Resolution, Solution, solve
-from sidestep.store.files import write_bytes
+from sidestep.safety.clearance.solve import STAGES, Resolution, Solution, solve
+from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
+from sidestep.world.capture_geometry import to_pursuer_frame
 
 _FORMAT = 1
 _SAVE_SECONDS = 20.0
@@ -109,15 +108,11 @@ class ClearanceTable(eqx.Module):
         """
         place, moved = z + move, offset + move
 
-        def after(pose: Float[AnyArray, "3"]) -> Scalar:
-            cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+        def after(pose: Float[Array, "3"]) -> Scalar:
+            turn = pose.at[:2].set(0.0)
+            return self.margin(to_pursuer_frame(place, pose), to_pursuer_frame(moved, turn), drift)
 
-            def seen(x: Scalar, y: Scalar) -> Float[Array, "2"]:
-                return jnp.stack([cosine * x + sine * y, cosine * y - sine * x])
-
-            return self.margin(seen(*(place - pose[:2])), seen(*moved), drift)
-
-        return jnp.min(jax.vmap(after)(poses))
+        return jnp.min(jax.vmap(after)(jnp.asarray(poses)))
 
     @property
     def farthest(self) -> float:
@@ -126,41 +121,15 @@ class ClearanceTable(eqx.Module):
 
     def save(self, path: str | Path) -> None:
         """Write the table to a file. **Raises** `OutputError` where that cannot be written."""
-        about = {
-            "format": _FORMAT,
-            "game": self.game.as_dict,
-            "grid": _plain(self.grid),
-            "directions": _plain(self.directions),
-            "sweeps": self.sweeps,
-            "change": self.change,
-        }
-        content = io.BytesIO()
-        np.savez_compressed(
-            content,
-            about=np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8),
-            clearance=np.asarray(self.clearance),
-            ridge=np.asarray(self.ridge),
-        )
-        write_bytes(path, content.getvalue())
+        _write(path, self, game=self.game.as_dict)
 
     @staticmethod
     def load(path: str | Path) -> ClearanceTable:
         """The table of a file. **Raises** `ValueError` where there is none that this version reads."""
         try:
-            with np.load(path) as file:
-                about = json.loads(file["about"].tobytes())
-                if about["format"] != _FORMAT:
-                    raise ValueError(f"format {about['format']}, not {_FORMAT}")
-                return ClearanceTable(
-                    jnp.asarray(file["clearance"]),
-                    jnp.asarray(file["ridge"]),
-                    ClearanceGame(**about["game"]),
-                    _grid(about["grid"]),
-                    Angles(*about["directions"]),
-                    about["sweeps"],
-                    about["change"],
-                )
-        except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+            solution, about = _read(path)
+            return ClearanceTable.of(ClearanceGame(**about["game"]), solution)
+        except (OSError, ValueError, KeyError, TypeError, CheckpointError) as error:
             raise ValueError(f"{path} is no clearance table of this version of sidestep ({error})") from None
 
 
@@ -189,13 +158,13 @@ def clearance_table(
         with suppress(ValueError):
             return ClearanceTable.load(kept)
     on_the_way = kept.with_name(f"{key}.part.npz")
-    saved, latest = time.monotonic(), None
+    saved, latest, begun = time.monotonic(), None, None
 
     def after(solution: Solution) -> None:
         nonlocal saved, latest
         latest = solution
         if time.monotonic() - saved > _SAVE_SECONDS:
-            _write_part(on_the_way, solution)
+            _write(on_the_way, solution, stage=solution.stage)
             saved = time.monotonic()
         if progress is not None:
             progress(solution)
@@ -203,11 +172,12 @@ def clearance_table(
 
     try:
         with _interrupts.held():
-            begun = _read_part(on_the_way)
+            with suppress(OSError, ValueError, KeyError, TypeError, CheckpointError):
+                begun, _ = _read(on_the_way)
             solution = solve(game, resolution, periods=periods, begun=begun, progress=after)
     except KeyboardInterrupt:
         if latest is not None:
-            _write_part(on_the_way, latest)
+            _write(on_the_way, latest, stage=latest.stage)
         raise
     table = ClearanceTable.of(game, solution)
     table.save(kept)
@@ -215,31 +185,28 @@ def clearance_table(
     return table
 
 
-def _write_part(path: Path, solution: Solution) -> None:
-    content = io.BytesIO()
-    where = {"grid": _plain(solution.grid), "directions": _plain(solution.directions)}
-    where |= {"stage": solution.stage, "sweeps": solution.sweeps, "change": solution.change}
-    about = np.frombuffer(json.dumps(where).encode(), np.uint8)
-    np.savez(content, about=about, clearance=solution.clearance, ridge=solution.ridge)
-    write_bytes(path, content.getvalue())
+def _write(path: str | Path, solution: Solution | ClearanceTable, **about: Any) -> None:
+    write_arrays(
+        Path(path),
+        {"clearance": solution.clearance, "ridge": solution.ridge},
+        format=_FORMAT,
+        grid=_plain(solution.grid),
+        directions=_plain(solution.directions),
+        sweeps=solution.sweeps,
+        change=solution.change,
+        **about,
+    )
 
 
-def _read_part(path: Path) -> Solution | None:
-    """A solution on the way, None where there is none that can be read."""
-    try:
-        with np.load(path) as file:
-            about = json.loads(file["about"].tobytes())
-            return Solution(
-                _grid(about["grid"]),
-                Angles(*about["directions"]),
-                file["ridge"],
-                file["clearance"],
-                about["stage"],
-                about["sweeps"],
-                about["change"],
-            )
-    except (OSError, ValueError, KeyError, TypeError, EOFError):
-        return None
+def _read(path: str | Path) -> tuple[Solution, dict[str, Any]]:
+    """What `_write` wrote; a finished table counts as in the last stage."""
+    arrays, about = read_named(Path(path))
+    if about["format"] != _FORMAT:
+        raise ValueError(f"format {about['format']}, not {_FORMAT}")
+    clearance, ridge = (arrays[f"['{name}']"] for name in ("clearance", "ridge"))
+    grid, directions = _grid(about["grid"]), Angles(*about["directions"])
+    stage = about.get("stage", len(STAGES) - 1)
+    return Solution(grid, directions, ridge, clearance, stage, about["sweeps"], about["change"]), about
 
 
 def _plain(part: Any) -> Any:
