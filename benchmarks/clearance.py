@@ -2,11 +2,12 @@
 
     python benchmarks/clearance.py --capture-distance 0.15 --json clearance.json
 
-For each resolution: time and memory, the largest clearance, the share of states with evader and obstacle
-within 0.5 m that are safe one by one and not jointly, the largest difference from the
-finest table at random states, and the share of random states on the boundary (h' in 0 to 0.1 m, where the
-obstacle matters) from which one of 96 held velocities keeps the set for a period against pursuer motions four
-times as dense as those solved for, with how far the worst of them falls out of it.
+For each resolution: time and memory (the peak of all tables solved so far), the largest clearance, the
+share of states with evader and obstacle within 0.5 m that are safe one by one and not jointly, the
+largest difference from the finest table at random states, and the share of random states on the boundary
+(h' in 0 to 0.1 m, where the obstacle matters) from which one of 96 held velocities keeps the set for a
+period against pursuer motions four times as dense as those solved for, with how far the worst of them
+falls out of it.
 
 The table is solved for a drift of `--solved-drift`, larger than the true one, `--drift`: what is to spare
 absorbs the interpolation.

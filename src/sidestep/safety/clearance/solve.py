@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep._bounds import bounded, check
 from sidestep._packages import needed
+from sidestep.safety.certificate.flow_map import seen_from
 from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Place, Spacing
 
@@ -113,7 +114,6 @@ def _transitions(
 ) -> _Transitions:
     moves = game.velocities(resolution.headings) * game.control_period
     motions = game.motions(resolution.turns, resolution.drives)
-    cosine, sine = np.cos(motions[:, 2]), np.sin(motions[:, 2])
     count = grid.heights.count
     left, right = np.divmod(np.arange(grid.first_committed), count)
     # By the mirror the others are never read, but for the first beyond the axis.
@@ -123,12 +123,8 @@ def _transitions(
     counts, reached = [], []
     for begin in range(0, len(nodes), _BLOCK):
         z = points[nodes[begin : begin + _BLOCK]]
-        after = z[:, None, None] + moves[None, :, None] - motions[None, None, :, :2]
-        place = grid.place(
-            np,
-            cosine * after[..., 0] + sine * after[..., 1],
-            cosine * after[..., 1] - sine * after[..., 0],
-        )
+        after = seen_from(z[:, None, None] + moves[None, :, None], motions[None, None])
+        place = grid.place(np, after[..., 0], after[..., 1])
         allowed = np.min(place.height, -1) >= -1e-9
         place = Place(*(np.broadcast_to(part, place.height.shape)[allowed] for part in place))
         corners, weights = place.corners(np)
