@@ -62,7 +62,7 @@ COMMANDS = {
     ),
     "falsify": Command(
         ["falsify", "--out", "{out}/a search", "--shield", "game", "--episodes", "64", "--batch", "16",
-         "--seconds", "20", "--attacks", "pursuers", "bang-bang", "cross-entropy"]
+         "--seconds", "6", "--attacks", "pursuers", "cross-entropy"]
     ),
     "campaign": Command(["campaign", "{run}/../grid.toml", "--out", "{out}/a grid", "--workers", "2"]),
     "twin": Command(
@@ -118,6 +118,7 @@ class Study:
 
     def __init__(self, name: str, run: Path, chance: random.Random, paste_every: int):
         self.command, self.run, self.chance, self.paste_every = COMMANDS[name], run, chance, paste_every
+        self.within = 0.0
         self.faults: list[str] = []
         self.statuses: Counter[int] = Counter()
         self.waits: list[float] = []
@@ -126,33 +127,31 @@ class Study:
     def words(self, out: Path) -> list[str]:
         return [word.format(run=self.run, out=out) for word in self.command.words]
 
-    def length(self) -> float:
-        """Seconds that the command takes when left alone; compiled programs are kept by it."""
+    def measure(self) -> None:
+        """How long the command takes when left alone; compiled programs are kept by it."""
         if self.command.seconds is not None:
-            return self.command.seconds
+            self.within = self.command.seconds
+            return
         with tempfile.TemporaryDirectory() as out:
             begun = time.monotonic()
             child = start(self.words(Path(out)), Path(out))
             text, _ = child.communicate()
             if child.returncode:
                 raise SystemExit(f"left alone it ended with {child.returncode}: {text[-2000:]}")
-            return time.monotonic() - begun
+            self.within = time.monotonic() - begun
 
-    def interrupt(self, number: int, within: float) -> float:
-        """Once, at a random moment; a command that has ended by then is started again.
-
-        **Returns** `within`, or the time in which such a command ended: less than the first run, which
-        compiled.
-        """
+    def interrupt(self, number: int) -> None:
+        """Once, at a random moment; a command that has ended by then is started again, and the next are
+        interrupted within the time that it took: less than the first run, which compiled."""
         while True:
             out = Path(tempfile.mkdtemp())
             child, begun = start(self.words(out), out), time.monotonic()
-            delay = self.chance.uniform(0.15, within)
+            delay = self.chance.uniform(0.15, self.within)
             while child.poll() is None and time.monotonic() < begun + delay:
                 time.sleep(0.005)
             ended = child.poll() is not None
             if ended and child.returncode == 0:
-                within = time.monotonic() - begun
+                self.within = time.monotonic() - begun
             begun = time.monotonic()
             child.send_signal(signal.SIGINT)
             text, _ = child.communicate()
@@ -173,7 +172,18 @@ class Study:
             if advice is not None and number % self.paste_every == 0:
                 self.paste(advice[1], out, delay)
         shutil.rmtree(out)
-        return within
+
+    def result(self) -> dict[str, object]:
+        return {
+            "interrupts": len(self.waits),
+            "statuses": {str(status): count for status, count in self.statuses.items()},
+            "before_the_first_line": self.early,
+            "faults": self.faults,
+            "advice_pasted": self.pasted,
+            "seconds_alone": self.within,
+            "seconds_to_end_median": statistics.median(self.waits),
+            "seconds_to_end_longest": max(self.waits),
+        }
 
     def paste(self, line: str, out: Path, delay: float) -> None:
         """What was printed, in a shell, must finish the work."""
@@ -217,29 +227,22 @@ def main() -> int:
                 raise SystemExit("the small run that others need could not be trained")
             for name in names:
                 study = Study(name, run, random.Random(f"{options.seed} {name}"), options.paste_every)
-                within = study.length()
+                study.measure()
                 for number in range(options.count):
-                    within = study.interrupt(number, within)
-                results[name] = {
-                    "interrupts": options.count,
-                    "statuses": {str(status): count for status, count in study.statuses.items()},
-                    "before_the_first_line": study.early,
-                    "faults": study.faults,
-                    "advice_pasted": study.pasted,
-                    "seconds_alone": within,
-                    "seconds_to_end_median": statistics.median(study.waits),
-                    "seconds_to_end_longest": max(study.waits),
-                }
+                    study.interrupt(number)
+                    results[name] = study.result()
+                    if options.out is not None:
+                        write_json(options.out, results)
+                    if sys.stderr.isatty():
+                        print(f"\r{name}: {number + 1} of {options.count}", end="", file=sys.stderr)
                 print(
-                    f"{name}: {options.count} interrupts within {within:.1f} s, {len(study.faults)} faults, "
-                    f"{study.early} before the first line, {study.pasted} pasted; ended after "
+                    f"{name}: {options.count} interrupts within {study.within:.1f} s, "
+                    f"{len(study.faults)} faults, {study.early} before the first line, {study.pasted} pasted; ended after "
                     f"{statistics.median(study.waits):.2f} s (median), {max(study.waits):.1f} s (longest)",
                     flush=True,
                 )
                 for fault in study.faults:
                     print(f"  {fault}", flush=True)
-                if options.out is not None:
-                    write_json(options.out, results)
         finally:
             for process in busy:
                 process.kill()
