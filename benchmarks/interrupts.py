@@ -237,8 +237,9 @@ def main() -> int:
                         print(f"\r{name}: {number + 1} of {options.count}", end="", file=sys.stderr)
                 print(
                     f"{name}: {options.count} interrupts within {study.within:.1f} s, "
-                    f"{len(study.faults)} faults, {study.early} before the first line, {study.pasted} pasted; ended after "
-                    f"{statistics.median(study.waits):.2f} s (median), {max(study.waits):.1f} s (longest)",
+                    f"{len(study.faults)} faults, {study.early} before the first line, "
+                    f"{study.pasted} pasted; ended after {statistics.median(study.waits):.2f} s (median), "
+                    f"{max(study.waits):.1f} s (longest)",
                     flush=True,
                 )
                 for fault in study.faults:
