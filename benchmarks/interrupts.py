@@ -227,6 +227,8 @@ def main() -> int:
                 raise SystemExit("the small run that others need could not be trained")
             for name in names:
                 study = Study(name, run, random.Random(f"{options.seed} {name}"), options.paste_every)
+                # Twice: the first time compiles what the others find compiled.
+                study.measure()
                 study.measure()
                 for number in range(options.count):
                     study.interrupt(number)
