@@ -16,7 +16,8 @@ from typing import Any
 
 from machine import machine
 from sidestep.safety.certificate.greedy_chase import chase
-from sidestep.safety.certificate.sampled_design import (
+from sidestep.safety.certificate.shield_check import shield_level
+from sidestep.safety.sampled.sampled_design import (
     FINE,
     best_design,
     broken_level,
@@ -25,8 +26,7 @@ from sidestep.safety.certificate.sampled_design import (
     largest_true,
     spare,
 )
-from sidestep.safety.certificate.sampled_game import Design, SampledGame
-from sidestep.safety.certificate.shield_check import shield_level
+from sidestep.safety.sampled.sampled_game import Design, SampledGame
 from sidestep.store.files import write_json
 from sidestep.world import load_scenario
 

@@ -12,12 +12,12 @@ import pytest
 from sidestep.cli import main
 from sidestep.safety import make_shield
 from sidestep.safety.certificate import certify
-from sidestep.safety.certificate.flow_map import seen_from, side_value, turn_drive_turn
 from sidestep.safety.certificate.nearest_changes import PARAMETERS
-from sidestep.safety.certificate.sampled_design import FINE, delay_cost, holds
-from sidestep.safety.certificate.sampled_game import SampledGame
 from sidestep.safety.certificate.shield_check import shield_level
 from sidestep.safety.certificate.survival import certain_run
+from sidestep.safety.sampled.flow_map import seen_from, side_value, turn_drive_turn
+from sidestep.safety.sampled.sampled_design import FINE, delay_cost, holds
+from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.world import World, load_scenario
 
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from sidestep.pursuit import CaptureGame
-from sidestep.safety.certificate.flow_map import (
+from sidestep.safety.certificate.greedy_chase import chase, random_wheels
+from sidestep.safety.sampled.flow_map import (
     advance,
     closest_alignment,
     side_value,
     turn_drive_turn,
     wheel_motions,
 )
-from sidestep.safety.certificate.greedy_chase import chase, random_wheels
-from sidestep.safety.certificate.sampled_design import COARSE, FINE, best_design, broken_level, holds
-from sidestep.safety.certificate.sampled_game import Cells, Design, SampledGame, found_slack, slack
+from sidestep.safety.sampled.sampled_design import COARSE, FINE, best_design, broken_level, holds
+from sidestep.safety.sampled.sampled_game import Cells, Design, SampledGame, found_slack, slack
 from sidestep.world.robots import drive
 
 PAPER = {"evader_speed": 0.1574, "pursuer_speed": 0.2, "half_axle": 0.2}

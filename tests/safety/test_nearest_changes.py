@@ -14,8 +14,8 @@ from sidestep.safety.certificate.nearest_changes import (
     nearest_changes,
     nearest_pairs,
 )
-from sidestep.safety.certificate.sampled_game import SampledGame
 from sidestep.safety.certificate.situation import Situation
+from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.world import load_scenario
 
 ALL = tuple(WHOSE)

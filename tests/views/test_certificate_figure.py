@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sidestep.safety.certificate import certify
-from sidestep.safety.certificate.flow_map import side_value
+from sidestep.safety.sampled.flow_map import side_value
 from sidestep.views import certificate_figure
 from sidestep.views.certificate_figure import set_outline
 from sidestep.world import load_scenario

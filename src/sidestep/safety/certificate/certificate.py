@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from sidestep.safety.certificate.nearest_changes import Change, PairChange
-from sidestep.safety.certificate.sampled_game import Design
 from sidestep.safety.certificate.shield_check import ShieldLevel
 from sidestep.safety.certificate.situation import Situation
 from sidestep.safety.certificate.survival import Survival
+from sidestep.safety.sampled.sampled_game import Design
 
 
 @dataclass(frozen=True)

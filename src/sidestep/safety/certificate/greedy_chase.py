@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.safety.certificate.flow_map import seen_from, side_value, wheel_motions
-from sidestep.safety.certificate.sampled_game import Design, SampledGame, overlap
+from sidestep.safety.sampled.flow_map import seen_from, side_value, wheel_motions
+from sidestep.safety.sampled.sampled_game import Design, SampledGame, overlap
 
 Points = Float[np.ndarray, "n 2"]
 Numbers = Float[np.ndarray, "n"]

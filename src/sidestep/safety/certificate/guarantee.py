@@ -27,7 +27,6 @@ import numpy as np
 from sidestep._bounds import DELAY, DISTANCE, HEADING_ERROR, TRACKING_ERROR, Bound, taken
 from sidestep.safety.certificate.certificate import Certificate
 from sidestep.safety.certificate.claims import claims_of
-from sidestep.safety.certificate.flow_map import seen_from, side_value
 from sidestep.safety.certificate.nearest_changes import (
     MINE,
     Change,
@@ -36,17 +35,18 @@ from sidestep.safety.certificate.nearest_changes import (
     nearest_changes,
     nearest_pairs,
 )
-from sidestep.safety.certificate.sampled_design import (
+from sidestep.safety.certificate.shield_check import shield_level
+from sidestep.safety.certificate.situation import Situation, plain, situation_of
+from sidestep.safety.certificate.survival import survival
+from sidestep.safety.sampled.flow_map import seen_from, side_value
+from sidestep.safety.sampled.sampled_design import (
     best_design,
     broken_level,
     delay_cost,
     outruns,
     tightest_angle,
 )
-from sidestep.safety.certificate.sampled_game import Design, SampledGame
-from sidestep.safety.certificate.shield_check import shield_level
-from sidestep.safety.certificate.situation import Situation, plain, situation_of
-from sidestep.safety.certificate.survival import survival
+from sidestep.safety.sampled.sampled_game import Design, SampledGame
 from sidestep.safety.shields.adapted import covered, of_control_point
 from sidestep.world.scenario import Scenario
 

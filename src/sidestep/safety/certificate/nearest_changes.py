@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
-from sidestep.safety.certificate.sampled_design import delay_cost, largest_true, spare
 from sidestep.safety.certificate.situation import Situation
+from sidestep.safety.sampled.sampled_design import delay_cost, largest_true, spare
 
 _TOLERANCE = 2e-5
 """Of a change, as a share of the largest one tried."""

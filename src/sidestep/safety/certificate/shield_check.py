@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from sidestep._arrays import Scalar
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
 from sidestep.safety.barriers.sampling_margin import sampling_margin, with_margins
-from sidestep.safety.certificate.flow_map import seen_from, side_value, turn_drive_turn
+from sidestep.safety.sampled.flow_map import seen_from, side_value, turn_drive_turn
 from sidestep.world.scenario import Scenario
 
 _LEVELS = 80

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.safety.certificate.sampled_game import SampledGame
+from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.safety.shields.adapted import covered, of_control_point
 from sidestep.world.scenario import Scenario
 

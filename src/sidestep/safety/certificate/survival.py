@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.pursuit.game import CaptureGame
-from sidestep.safety.certificate.flow_map import advance
-from sidestep.safety.certificate.sampled_game import SampledGame
+from sidestep.safety.sampled.flow_map import advance
+from sidestep.safety.sampled.sampled_game import SampledGame
 
 _BEARINGS = 91
 

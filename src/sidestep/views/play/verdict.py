@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sidestep.safety.certificate.sampled_design import COARSE, holds
-from sidestep.safety.certificate.sampled_game import SampledGame
+from sidestep.safety.sampled.sampled_design import COARSE, holds
+from sidestep.safety.sampled.sampled_game import SampledGame
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sidestep.safety.certificate.flow_map import advance
-from sidestep.safety.certificate.sampled_game import (
+from sidestep.safety.sampled.flow_map import advance
+from sidestep.safety.sampled.sampled_game import (
     Cells,
     Design,
     SampledGame,

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.safety.certificate.flow_map import (
+from sidestep.safety.sampled.flow_map import (
     advance,
     bending,
     closest_alignment,
