@@ -21,7 +21,7 @@ NOT_NEGATIVE = [
     "obstacle_separation", "target_separation",
 ]  # fmt: skip
 COUNTS = ["pursuer_count", "obstacle_count", "episode_steps"]
-CHOICES = ["action", "obstacle_directions", "frame"]
+CHOICES = ["action", "obstacle_directions", "obstacle_motion", "frame"]
 ARRAYS = ["obstacle_velocity", "evader_start", "target_start", "pursuer_starts", "obstacle_starts"]
 
 
@@ -67,7 +67,12 @@ def test_count_of_zero_where_one_is_needed(field):
 @pytest.mark.parametrize("field", CHOICES)
 @pytest.mark.parametrize("value", ["sideways", 1, None, ["velocity"]])
 def test_unknown_mode_lists_the_known_ones(field, value):
-    known = {"action": "'heading'", "obstacle_directions": "'random'", "frame": "'world'"}[field]
+    known = {
+        "action": "'heading'",
+        "obstacle_directions": "'random'",
+        "obstacle_motion": "'adversarial'",
+        "frame": "'world'",
+    }[field]
     refused(repr(value), known, **{field: value})
 
 
@@ -100,7 +105,7 @@ def test_every_error_is_a_value_error():
 def test_unknown_scenario_lists_the_presets():
     with pytest.raises(
         ScenarioError,
-        match=r"no scenario 'papr': neither a preset \(paper, paper-test, quadrotor, quadrotor-test\) nor",
+        match=r"no scenario 'papr': neither a preset \(paper, paper-test, paper-0\.10, paper-0\.15, quadrotor, quadrotor-test\) nor",
     ):
         load_scenario("papr")
 
@@ -174,6 +179,7 @@ CHANGED = {
     "action": "heading",
     "frame": "world",
     "obstacle_directions": "random",
+    "obstacle_motion": "adversarial",
     "episode_steps": 77,
     "obstacle_starts": [[0.7, 0.1], [-0.7, 0.3]],
     "evader_start": [0.1, 0.2],

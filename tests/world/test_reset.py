@@ -131,6 +131,23 @@ def test_random_drift_keeps_its_speed_and_turns_every_way():
     assert np.min(np.histogram(np.arctan2(*drift.T), bins=8, range=(-np.pi, np.pi))[0]) > 150
 
 
+def test_an_adversarial_obstacle_heads_for_where_the_evader_will_be():
+    scenario = Scenario(obstacle_motion="adversarial", obstacle_velocity=(0.03, 0.04), obstacle_count=2)
+    worlds, velocity = many(scenario, 20), jnp.array([0.1, -0.05])
+    wheels = jnp.zeros((1, 2))
+    moved, _ = eqx.filter_jit(jax.vmap(lambda world: scenario.step(world, velocity, wheels)))(worlds)
+    aim = np.asarray(moved.evader[:, None] - worlds.obstacles[..., :2])
+    expected = 0.05 * aim / np.linalg.norm(aim, axis=-1, keepdims=True)
+    np.testing.assert_allclose(moved.obstacles[..., 2:], expected, atol=1e-6)
+    step = np.asarray(moved.obstacles[..., :2] - worlds.obstacles[..., :2])
+    np.testing.assert_allclose(step, 0.05 * expected, atol=1e-6)
+    # Where it already is at that place it does not move, and nothing is divided by zero.
+    there = jax.tree.map(lambda leaf: leaf[0], worlds)
+    there = eqx.tree_at(lambda w: w.obstacles, there, there.obstacles.at[:, :2].set(there.evader))
+    still, _ = eqx.filter_jit(scenario.step)(there, jnp.zeros(2), wheels)
+    np.testing.assert_array_equal(still.obstacles[:, :2], there.obstacles[:, :2])
+
+
 def test_reset_ends_even_where_no_start_exists():
     impossible = eqx.tree_at(lambda s: s.initial_separation, Scenario(), jnp.array(100.0))
     world = eqx.filter_jit(Scenario.reset)(impossible, jax.random.key(0))

@@ -61,7 +61,9 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, **about: Any) -> None:
+def write_arrays(
+    path: Path, tree: Any, *, rows: dict[str, int] | None = None, compressed: bool = False, **about: Any
+) -> None:
     """Write a pytree of arrays and the metadata `about`, whole or not at all.
 
     Of leaves at or below a name in `rows` only that many leading rows are stored. On reading, the other rows
@@ -73,7 +75,7 @@ def write_arrays(path: Path, tree: Any, *, rows: dict[str, int] | None = None, *
     manifest = json.dumps({**about, "digest": _digest(arrays), "rows": rows})
     buffer = io.BytesIO()
     stored: dict[str, Any] = {_MANIFEST: np.frombuffer(manifest.encode(), np.uint8), **_slots(arrays)}
-    np.savez(buffer, **stored)
+    (np.savez_compressed if compressed else np.savez)(buffer, **stored)
     write_bytes(path, buffer.getvalue())
 
 

@@ -51,6 +51,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pursuer_starts": ((1.0, -0.5, 0.0),),
         "target_start": (2.5, 0.0),
     },
+    # The paper's robots with less room to keep, so that pursuer and obstacle can both be kept away for ever:
+    # sidestep comes with their clearance tables.
+    "paper-0.10": {"capture_distance": 0.10},
+    "paper-0.15": {"capture_distance": 0.15},
     # A small quadrotor among columns, pursued by a faster aircraft with wide turns.
     "quadrotor": _QUADROTOR,
     # A fixed scene of that kind: the aircraft comes head-on, with columns on both sides of the path.

@@ -52,7 +52,9 @@ class Scenario(eqx.Module):
 
     - `evader_speed` v_e, `pursuer_speed` V (wheel rim), m/s
     - `pursuer_half_axle` b, `capture_distance` l, `collision_distance` d_oc, `reach_distance` d_t, m
-    - `obstacle_velocity (2,)`, m/s; with `obstacle_directions="random"` only its magnitude is used
+    - `obstacle_velocity (2,)`, m/s; with `obstacle_directions="random"` or `obstacle_motion="adversarial"`
+    only
+      its magnitude is used
     - `control_period` T, s
 
     **Shield** `pursuer_gain`, `obstacle_gain`, 1/s.
@@ -64,8 +66,9 @@ class Scenario(eqx.Module):
     capture set. The square only bounds the starts: the plane has no walls.
 
     **Counts and modes** `pursuer_count`, `obstacle_count`, `episode_steps` (control periods),
-    `action` = `"velocity"` (disc |u| <= v_e) or `"heading"` (circle |u| = v_e), `frame` = `"target"` or
-    `"world"` (axes of observation and policy action).
+    `obstacle_motion` = `"steady"` or `"adversarial"`: obstacles then head for where the evader will be at the
+    end of each period; `action` = `"velocity"` (disc |u| <= v_e) or `"heading"` (circle |u| = v_e), `frame` =
+    `"target"` or `"world"` (axes of observation and policy action).
 
     **Custom robots** `evader_model`, `pursuer_model`, see `EvaderModel` and `PursuerModel`; None for the
     omnidirectional evader and the differential drive. They are code, and so not in files.
@@ -101,6 +104,7 @@ class Scenario(eqx.Module):
     episode_steps: int = static_field(5000, least=1)
     action: str = static_field("velocity", one_of("velocity", "heading"))
     obstacle_directions: str = static_field("fixed", one_of("fixed", "random"))
+    obstacle_motion: str = static_field("steady", one_of("steady", "adversarial"))
     frame: str = static_field("target", one_of("target", "world"))
 
     @property
@@ -203,6 +207,7 @@ class Scenario(eqx.Module):
         velocity = self.executable(action)
         shape = (self.pursuer_count, *velocity.shape)
         wheels = jax.vmap(self.drivable)(jnp.reshape(wheel_speeds, shape))
+        world = self._aimed(world, velocity)
         if self.evader_model is None:
             given = (self, world, velocity, wheels, period)
             # Every event uses them, and in lanes XLA would recompute them for each.
@@ -281,10 +286,23 @@ class Scenario(eqx.Module):
         """The world one control period later, for commands within the robots' limits."""
         # Counting whole periods keeps the float32 time exact enough for the time limit.
         periods = jnp.round(world.time / self.control_period) + 1.0
+        world = self._aimed(world, velocity)
         there = self._moved(world, velocity, wheel_speeds, self.control_period)
         return eqx.tree_at(
             lambda w: (w.time, w.wheel_speeds), there, (periods * self.control_period, wheel_speeds)
         )
+
+    def _aimed(self, world: World, velocity: Float[Array, "2 *lanes"]) -> World:
+        """The world with the velocities of obstacles that move adversarially."""
+        if self.obstacle_motion == "steady" or self.obstacle_count == 0:
+            return world
+        end = glide(world.evader, velocity, self.control_period)
+        x, y = end[0] - world.obstacles[:, 0], end[1] - world.obstacles[:, 1]
+        apart = jnp.maximum(length(x, y), 1e-6)
+        speed = length(self.obstacle_velocity[0], self.obstacle_velocity[1])
+        aimed = jnp.stack([speed * x / apart, speed * y / apart], axis=1)
+        obstacles = jnp.concatenate([world.obstacles[:, :2], aimed], axis=1)
+        return eqx.tree_at(lambda w: w.obstacles, world, obstacles)
 
     def _moved(self, world: World, velocity: Array, wheel_speeds: Array, duration: Scalar) -> World:
         """The world after `duration` (s); time and wheel speeds are not updated."""
