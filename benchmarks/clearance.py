@@ -34,17 +34,17 @@ RESOLUTIONS = {
     "coarse": Resolution(
         height=0.002, growth=1.25, share=0.01, share_growth=1.35, bearings=12, angles=96, ridge=0.025, turns=4
     ),
-    "default": Resolution(),
-    "fine": Resolution(
-        height=0.0005,
-        growth=1.1,
-        share=0.002,
-        share_growth=1.18,
-        bearings=30,
-        angles=216,
-        ridge=0.008,
-        turns=8,
+    "middle": Resolution(
+        height=0.001,
+        growth=1.15,
+        share=0.004,
+        share_growth=1.25,
+        angles=144,
+        ridge=0.014,
+        headings=48,
+        turns=6,
     ),
+    "default": Resolution(),
 }
 BATCH = 512
 
@@ -137,7 +137,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     scenario = sidestep.load_scenario("paper", capture_distance=asked.capture_distance)
-    game = ClearanceGame.of(scenario, obstacle_speed=asked.solved_drift)
+    spare = (asked.solved_drift - asked.drift) * float(scenario.control_period)
+    game = ClearanceGame.of(scenario, spare=spare)
     results: dict[str, Any] = {"game": game.as_dict, "true drift, m/s": asked.drift, "tables": {}}
     finest = None
     for name in reversed(asked.resolutions):

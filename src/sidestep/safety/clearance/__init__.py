@@ -2,6 +2,15 @@
 
 from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.solve import Resolution, Solution, solve
-from sidestep.safety.clearance.table import ClearanceTable, clearance_table
+from sidestep.safety.clearance.table import STEP, ClearanceTable, clearance_table, shipped_table
 
-__all__ = ["ClearanceGame", "ClearanceTable", "Resolution", "Solution", "clearance_table", "solve"]
+__all__ = [
+    "STEP",
+    "ClearanceGame",
+    "ClearanceTable",
+    "Resolution",
+    "Solution",
+    "clearance_table",
+    "shipped_table",
+    "solve",
+]

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep._bounds import within
-from sidestep.safety.certificate.sampled_design import COARSE, best_angle
-from sidestep.safety.certificate.sampled_game import SampledGame
+from sidestep.safety.sampled.sampled_design import COARSE, best_angle
+from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.world import Scenario
 
 
@@ -35,14 +35,12 @@ class ClearanceGame:
     can_stop: bool = True
 
     @staticmethod
-    def of(
-        scenario: Scenario, *, angle: float | None = None, obstacle_speed: float | None = None
-    ) -> ClearanceGame:
+    def of(scenario: Scenario, *, angle: float | None = None, spare: float = 0.0) -> ClearanceGame:
         """That of a scenario.
 
         **Arguments:** `angle` S' (rad), by default a quarter of the way from S to that with the most slack
         against the pursuer alone: a wider one shortens what is lost per period and lengthens the tip;
-        `obstacle_speed` (m/s) for more than the scenario's own drift.
+        `spare` (m), how much farther than by its drift an obstacle may come in a period.
 
         **Raises** `ValueError` where no angle lets the evader keep the capture distance at this period.
         """
@@ -56,11 +54,34 @@ class ClearanceGame:
             half_axle=float(scenario.pursuer_half_axle),
             capture_distance=float(scenario.capture_distance),
             collision_distance=float(scenario.collision_distance),
-            obstacle_speed=drift if obstacle_speed is None else obstacle_speed,
+            obstacle_speed=drift + spare / float(scenario.control_period),
             control_period=float(scenario.control_period),
             angle=angle,
             can_stop=scenario.action == "velocity",
         )
+
+    def refuses(self, scenario: Scenario) -> str:
+        """Why a table of this game does not serve a scenario; empty where it does: with the same robots and
+        period, or an evader that has it easier."""
+        if not scenario.built_in:
+            return "it has robots of its own"
+        drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
+        compared = (
+            ("evader_speed", float(scenario.evader_speed), -1),
+            ("pursuer_speed", float(scenario.pursuer_speed), 0),
+            ("half_axle", float(scenario.pursuer_half_axle), 0),
+            ("capture_distance", float(scenario.capture_distance), 1),
+            ("collision_distance", float(scenario.collision_distance), 1),
+            ("obstacle_speed", drift, 1),
+            ("control_period", float(scenario.control_period), 0),
+        )
+        for name, value, harder in compared:
+            solved = getattr(self, name)
+            if harder * (value - solved) > 1e-6 * solved or (not harder and abs(value / solved - 1.0) > 1e-6):
+                return f"its {name} is {value:.4g}, the table's {solved:.4g}"
+        if self.can_stop and scenario.action != "velocity":
+            return "its evader cannot stop, the table's can"
+        return ""
 
     @property
     def as_dict(self) -> dict[str, float]:

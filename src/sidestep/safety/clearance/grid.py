@@ -112,7 +112,7 @@ class Grid(NamedTuple):
 
     `capture_distance` l, `angle` S'; spacings of `heights` (a, and b in the open region), of `shares` of the
     straight part, from its end at b = 0 (0) to the arc (1); `bearings` cells on the arc; `gap`, how far below
-    0 the committed region's first node has its b.
+    0 the committed region's first node has its b; `reach`, how far the pursuer drives in a period.
     """
 
     capture_distance: float
@@ -121,6 +121,7 @@ class Grid(NamedTuple):
     shares: Spacing
     bearings: int
     gap: float
+    reach: float
 
     @property
     def committed(self) -> int:
@@ -156,10 +157,33 @@ class Grid(NamedTuple):
         edge = np.concatenate([meeting(height, other), round_], 1)
         return np.concatenate([meeting(left, right).reshape(-1, 2), edge.reshape(-1, 2)])
 
+    @property
+    def _ahead(self) -> float:
+        """Where on the axis (m) `nearer` begins to move states by all of `reach`."""
+        return 0.9 * self.capture_distance * math.cos(self.angle)
+
+    def nearer(self, xp: Any, ahead: Any) -> Any:
+        """`ahead` (m) after the pursuer has driven for a period, at either end; less close beside it, so that
+        no two states meet. The pursuer's best against the capture set's tip is to drive, so this moves the
+        surface at which it can take a side from the evader onto b = 0."""
+        return ahead - self.reach * xp.clip(ahead / self._ahead, -1.0, 1.0)
+
+    def farther(self, ahead: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """The inverse of `nearer`."""
+        near = self._ahead - self.reach
+        return ahead + self.reach * np.clip(ahead / near, -1.0, 1.0)
+
     def _straight(self, xp: Any, height: Any) -> Any:
         """How far b falls along the straight part at this height, m."""
         level = self.capture_distance
         return level - (level + xp.maximum(height, 0.0)) * math.cos(2.0 * self.angle) - self.gap
+
+    def height(self, xp: Any, ahead: Any, left: Any) -> Any:
+        """a (m) at z = (ahead, left) (m)."""
+        x, y = xp.abs(ahead), xp.abs(left)
+        cosine, sine = math.cos(self.angle), math.sin(self.angle)
+        arc = y * cosine >= x * sine
+        return xp.where(arc, xp.sqrt(x * x + y * y), x * cosine + y * sine) - self.capture_distance
 
     def place(self, xp: Any, ahead: Any, left: Any) -> Place:
         """Where states z = (ahead, left) (m) lie; `xp` is `numpy` or `jax.numpy`.

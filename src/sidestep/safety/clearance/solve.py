@@ -8,16 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep._bounds import bounded, check
 from sidestep._packages import needed
-from sidestep.safety.certificate.flow_map import seen_from
 from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Place, Spacing
+from sidestep.safety.sampled.flow_map import seen_from
 
 _BLOCK = 64
 """Nodes whose transitions are computed at once."""
@@ -35,16 +35,16 @@ class Resolution:
     `turns` and `drives` of the pursuer's motions, see `ClearanceGame.motions`.
     """
 
-    height: float = bounded(0.001, above=0.0, most=1.0, unit="m")
-    growth: float = bounded(1.15, above=1.0, most=10.0)
-    farthest: float = bounded(0.4, above=0.0, most=1e3, unit="m")
-    share: float = bounded(0.004, above=0.0, most=0.5)
-    share_growth: float = bounded(1.25, above=1.0, most=10.0)
+    height: float = bounded(0.0005, above=0.0, most=1.0, unit="m")
+    growth: float = bounded(1.1, above=1.0, most=10.0)
+    farthest: float = bounded(0.25, above=0.0, most=1e3, unit="m")
+    share: float = bounded(0.003, above=0.0, most=0.5)
+    share_growth: float = bounded(1.22, above=1.0, most=10.0)
     bearings: int = bounded(20, least=1, most=1000)
-    angles: int = bounded(144, least=8, most=4096)
-    ridge: float = bounded(math.radians(0.8), above=0.0, most=1.0, unit="rad")
-    headings: int = bounded(48, least=8, most=4096)
-    turns: int = bounded(6, least=1, most=1000)
+    angles: int = bounded(288, least=8, most=4096)
+    ridge: float = bounded(0.012, above=0.0, most=1.0, unit="rad")
+    headings: int = bounded(64, least=8, most=4096)
+    turns: int = bounded(8, least=1, most=1000)
     drives: int = bounded(2, least=2, most=100)
 
     def grid(self, game: ClearanceGame) -> Grid:
@@ -60,6 +60,7 @@ class Resolution:
             * max(game.evader_speed - game.pursuer_speed * math.cos(game.angle), 0.0)
             * game.control_period
             + 1e-5,
+            game.pursuer_speed * game.control_period,
         )
 
     def directions(self, *, even: bool = False) -> Angles:
@@ -82,31 +83,69 @@ STAGES = ("finding the ridge", "aligning", "solving")
 class Solution(NamedTuple):
     """A table, solved or on the way.
 
-    `clearance` (nodes, angles) m; `ridge` (nodes,) rad, from which the angles of a row count; `stage` in
-    `STAGES`, the `sweeps` of it, and the largest `change` in the last of them, m.
+    `clearance` and `after` (nodes, angles) m, R and R' of `sweep`; `ridge` (nodes,) rad, from which the
+    angles of a row count; `stage` in `STAGES`, the `sweeps` of it, and the largest `change` in the last of
+    them, m.
     """
 
     grid: Grid
     directions: Angles
     ridge: Float[np.ndarray, "n"]
     clearance: Float[np.ndarray, "n k"]
+    after: Float[np.ndarray, "n k"]
     stage: int
     sweeps: int
     change: float
 
 
+class _Reads(NamedTuple):
+    """Cells that a half of a period leads to, see `sweep`, and the nodes that each node depends on, one after
+    the other, with where those of each begin."""
+
+    place: Int[np.ndarray, "..."]
+    share: Float[np.ndarray, "... 2"]
+    turned: Float[np.ndarray, "... 2"]
+    reached: Int[np.ndarray, "r"]
+    begins: Int[np.ndarray, "n"]
+
+    def due(self, changed: Bool[np.ndarray, "nodes"]) -> Bool[np.ndarray, "n"]:
+        """Whether a node that each depends on has changed."""
+        return np.logical_or.reduceat(changed[self.reached], self.begins)
+
+
 @dataclass(frozen=True)
 class _Transitions:
-    """What `sweep` reads: pairs of node and control, and where each motion leads from there."""
+    """What `sweep` reads: the pursuer's half of a period for every one of `nodes`, then the evader's, in
+    pairs of node and control."""
 
     nodes: Int[np.ndarray, "n"]
-    first: Int[np.ndarray, "n1"]
+    pursuer: _Reads
+    spans: Int[np.ndarray, "n 2"]
     control: Int[np.ndarray, "p"]
-    place: Int[np.ndarray, "p m"]
-    share: Float[np.ndarray, "p m 2"]
-    turned: Float[np.ndarray, "p m 2"]
-    reached: tuple[Int[np.ndarray, "r"], Int[np.ndarray, "n1"]]
-    """The nodes that each depends on, one after the other, and where those of each begin."""
+    evader: _Reads
+
+
+def _read(
+    places: list[Place], headings: list[Any], ridge: Float[np.ndarray, "n"], own: list[Int[np.ndarray, "_"]]
+) -> _Reads:
+    """`headings` (rad) of the pursuer then; `own` says to which node each place belongs."""
+    parts, reached, sizes = [], [], []
+    for place, heading, node in zip(places, headings, own, strict=True):
+        corners, weights = place.corners(np)
+        offset = math.pi * place.turns - place.sign * heading - np.sum(weights * ridge[corners], -1)
+        parts.append(
+            (
+                place.node.astype(np.int32),
+                np.stack([place.up, place.along], -1).astype(np.float32),
+                np.stack([place.sign, offset], -1).astype(np.float32),
+            )
+        )
+        first = np.searchsorted(node, np.arange(node[-1] + 1))
+        each = [np.unique(some) for some in np.split(corners.reshape(len(corners), -1), first[1:])]
+        reached += each
+        sizes += [len(some) for some in each]
+    place, share, turned = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return _Reads(place, share, turned, np.concatenate(reached), np.concatenate([[0], np.cumsum(sizes)[:-1]]))
 
 
 def _transitions(
@@ -118,48 +157,46 @@ def _transitions(
     left, right = np.divmod(np.arange(grid.first_committed), count)
     # By the mirror the others are never read, but for the first beyond the axis.
     nodes = np.concatenate([np.flatnonzero(left >= right - 1), np.arange(grid.first_committed, grid.size)])
-    points = grid.points
-    parts: list[tuple[np.ndarray, ...]] = []
-    counts, reached = [], []
+    points = grid.points[nodes]
+    driven: tuple[list[Any], ...] = ([], [], [])
+    held: tuple[list[Any], ...] = ([], [], [])
+    controls, counts = [], []
     for begin in range(0, len(nodes), _BLOCK):
-        z = points[nodes[begin : begin + _BLOCK]]
-        after = seen_from(z[:, None, None] + moves[None, :, None], motions[None, None])
-        place = grid.place(np, after[..., 0], after[..., 1])
-        allowed = np.min(place.height, -1) >= -1e-9
-        place = Place(*(np.broadcast_to(part, place.height.shape)[allowed] for part in place))
-        corners, weights = place.corners(np)
-        offset = math.pi * place.turns - place.sign * motions[:, 2] - np.sum(weights * ridge[corners], -1)
-        parts.append(
-            (
-                np.nonzero(allowed)[1].astype(np.int32),
-                place.node.astype(np.int32),
-                np.stack([place.up, place.along], -1).astype(np.float32),
-                np.stack([place.sign, offset], -1).astype(np.float32),
-            )
-        )
-        each = np.sum(allowed, -1)
-        counts.append(each)
-        reached += [
-            np.unique(some) for some in np.split(corners.reshape(len(corners), -1), np.cumsum(each)[:-1])
-        ]
-    control, node, share, turned = (np.concatenate(part) for part in zip(*parts, strict=True))
-    stuck = np.concatenate(counts) == 0
-    if stuck.any():
+        z = points[begin : begin + _BLOCK]
+        before = np.stack([grid.farther(z[:, 0]), z[:, 1]], -1)
+        seen = seen_from(before[:, None], motions[None])
+        driven[0].append(grid.place(np, seen[..., 0], seen[..., 1]))
+        driven[1].append(motions[:, 2])
+        driven[2].append(np.arange(len(z)))
+        moved = z[:, None] + moves
+        allowed = np.min(_heights(grid, moved, motions), -1) >= -1e-9
+        node, control = np.nonzero(allowed)
+        held[0].append(grid.place(np, grid.nearer(np, moved[allowed][:, 0]), moved[allowed][:, 1]))
+        held[1].append(0.0)
+        held[2].append(node)
+        controls.append(control)
+        counts.append(np.sum(allowed, -1))
+    each = np.concatenate(counts)
+    if (each == 0).any():
         raise ValueError(
             f"with the design angle {math.degrees(game.angle):.4g} deg no velocity keeps the pursuit barrier "
-            f"for a period of {game.control_period:g} s at {np.mean(stuck):.1%} of the nodes; take another "
-            "angle, a smaller capture distance or a shorter period"
+            f"for a period of {game.control_period:g} s at {np.mean(each == 0):.1%} of the nodes; take "
+            "another angle, a smaller capture distance or a shorter period"
         )
-    sizes = [len(some) for some in reached]
+    ends = np.cumsum(each)
     return _Transitions(
         nodes,
-        np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
-        control,
-        node,
-        share,
-        turned,
-        (np.concatenate(reached), np.concatenate([[0], np.cumsum(sizes)])),
+        _read(*driven[:2], ridge, driven[2]),
+        np.stack([ends - each, ends], -1),
+        np.concatenate(controls),
+        _read(*held[:2], ridge, held[2]),
     )
+
+
+def _heights(grid: Grid, moved: Float[np.ndarray, "... 2"], motions: Float[np.ndarray, "m 3"]) -> Any:
+    """h' (m) after every motion."""
+    seen = seen_from(moved[..., None, :], motions)
+    return grid.height(np, seen[..., 0], seen[..., 1])
 
 
 def _settle(
@@ -171,41 +208,57 @@ def _settle(
     periods: int | None,
 ) -> Iterator[Solution]:
     """Sweep after sweep until nothing changes by more than `tolerance`, or for so many periods."""
-    from sidestep.safety.clearance.sweep import sweep
+    from sidestep.safety.clearance.sweep import evader_moves, pursuer_moves
 
-    grid, directions, ridge, table, stage, sweeps, change = begun
+    grid, directions, ridge, table, after, stage, sweeps, change = begun
     transitions = _transitions(game, grid, resolution, ridge)
+    nodes, driven, held = transitions.nodes, transitions.pursuer, transitions.evader
     angles, moves = directions.nodes, game.velocities(resolution.headings) * game.control_period
-    reached, begins = transitions.reached
-    due: Bool[np.ndarray, "n"] = np.ones(len(transitions.nodes), bool)
-    spans = np.stack([transitions.first[:-1], transitions.first[1:]], -1)
     strides = np.array([grid.heights.count, grid.committed, grid.first_committed])
-    table = table.copy()
-    while change > tolerance and due.any() and (periods is None or sweeps < periods):
-        nodes = transitions.nodes[due]
-        new = sweep(
+    changed = np.ones(grid.size, bool)
+    table, after, choice = table.copy(), after.copy(), np.zeros(table.shape, np.int16)
+    while True:
+        due = driven.due(changed)
+        was = after[nodes[due]]
+        after[nodes[due]] = pursuer_moves(
             table,
-            nodes,
-            spans[due],
-            transitions.control,
-            transitions.place,
+            nodes[due],
+            driven.place[due],
             strides,
-            transitions.share,
-            transitions.turned,
+            driven.share[due],
+            driven.turned[due],
+            angles,
+            ridge,
+        )
+        if change <= tolerance or (periods is not None and sweeps >= periods):
+            break
+        changed[:] = False
+        changed[nodes[due]] = np.any(after[nodes[due]] != was, axis=1)
+        due = held.due(changed) if sweeps else np.ones(len(nodes), bool)
+        new = evader_moves(
+            table,
+            after,
+            nodes[due],
+            transitions.spans[due],
+            transitions.control,
+            held.place,
+            strides,
+            held.share,
+            held.turned,
             angles,
             ridge,
             moves,
             game.obstacle_speed * game.control_period,
-            np.float32(most),
+            most,
+            choice,
         )
-        rise = np.max(new - table[nodes], axis=1)
-        table[nodes] = new
-        changed = np.zeros(grid.size, bool)
-        changed[nodes] = rise > 0.0
-        # A node is due again once a node that it depends on has changed.
-        due = np.logical_or.reduceat(changed[reached], begins[:-1])
-        sweeps, change = sweeps + 1, float(np.max(rise))
-        yield Solution(grid, directions, ridge, table, stage, sweeps, change)
+        rise = np.max(new - table[nodes[due]], axis=1, initial=0.0)
+        table[nodes[due]] = new
+        changed[:] = False
+        changed[nodes[due]] = rise > 0.0
+        sweeps, change = sweeps + 1, float(np.max(rise, initial=0.0))
+        yield Solution(grid, directions, ridge, table, after, stage, sweeps, change)
+    yield Solution(grid, directions, ridge, table, after, stage, sweeps, change)
 
 
 def _smooth(field: Float[np.ndarray, "a b"], weight: Float[np.ndarray, "a b"]) -> Float[np.ndarray, "a b"]:
@@ -288,7 +341,7 @@ def solve(
 
 def _start(game: ClearanceGame, grid: Grid, directions: Angles) -> Solution:
     clearance = np.full((grid.size, directions.count), game.collision_distance, np.float32)
-    return Solution(grid, directions, np.zeros(grid.size), clearance, 0, 0, math.inf)
+    return Solution(grid, directions, np.zeros(grid.size), clearance, clearance.copy(), 0, 0, math.inf)
 
 
 def _next(game: ClearanceGame, solution: Solution, resolution: Resolution, *, warm: bool) -> Solution:

@@ -1,11 +1,13 @@
 """One sweep of the fixed point over the nodes of a clearance table, compiled by Numba.
 
-For a node (z, phi) and a velocity u that keeps the pursuit barrier whatever the pursuer does in a period, the
-obstacle must be at least rho away, the root along the ray phi of
+A period has two halves. Whatever the pursuer does in it, seen from where it then is, the obstacle must be as
+far away as the table says there. So after the evader's move, z and the direction phi of the obstacle given,
 
-    |rho e_phi + u T| - v_c T = max over motions w of R(z_w, direction of (rho e_phi + u T) seen from there),
+    R'(z, phi) = max over motions w of R(z_w, phi_w),
 
-and the node's new clearance is the least rho over all such u, or the old one if that is larger.
+and before it, among the velocities u that keep the pursuit barrier, one must lead where that is kept: at
+least rho away, the root along the ray phi of |rho e_phi + u T| - v_c T = R'(z + u T, direction of rho e_phi +
+u T). A node's new clearance R is the least such rho, or the old one if that is larger.
 """
 
 from __future__ import annotations
@@ -25,6 +27,20 @@ def _cell(angles, angle):
     node = max(np.searchsorted(angles, angle, side="right") - 1, 0)
     end = angles[node + 1] if node + 1 < len(angles) else math.pi
     return node, angle - angles[node], end - angles[node]
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _mixed(table, low, strides, up, along, row):
+    """The table's row between the four nodes of a cell, and its first entry once more."""
+    count, one = table.shape[1], np.float32(1.0)
+    high = low + (strides[0] if low < strides[2] else strides[1])
+    a, b = (one - up) * (one - along), (one - up) * along
+    c, d = up * (one - along), up * along
+    for k in range(count):
+        lower = a * table[low, k] + b * table[low + 1, k]
+        row[k] = lower + c * table[high, k] + d * table[high + 1, k]
+    row[count] = row[0]
 
 
 @njit(cache=True, fastmath=True)
@@ -50,57 +66,97 @@ def _rotated(row, angles, sign, start, least):
 
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def sweep(table, nodes, spans, control, place, strides, share, turned, angles, ridge, moves, drift, most):
-    """New rows for `nodes`, (n, angles).
+def pursuer_moves(table, nodes, place, strides, share, turned, angles, ridge):
+    """R' in rows for `nodes`, (n, angles).
 
-    **Arguments:** `table` (nodes, angles) m; pairs `spans[i, 0]` to `spans[i, 1]` are the velocities
-    `control` that node `nodes[i]` may choose, `moves` (controls, 2) m each in one period; for every pair and
-    motion `place` (pairs, motions) the first node of the cell it leads to, `share` (pairs, motions, 2) its
-    weights upwards and along, and `turned` (pairs, motions, 2) the sign of phi there and its offset, less the
-    ridge's angle; `strides`, upwards, in the open region and the other, and the first node of that;
-    `angles` of a row, rad; `ridge` of every node, rad; `drift` v_c T, m; `most`, m, stands for every larger
-    clearance.
+    **Arguments:** `table` (nodes, angles) R, m; for every one of `nodes` and motion `place` (n, motions) the
+    first node of the cell it leads to, `share` (n, motions, 2) its weights upwards and along, and `turned`
+    (n, motions, 2) the sign of phi there and its offset, less the ridge's angle; `strides`, upwards, in the
+    open region and the other, and the first node of that; `angles` of a row, rad; `ridge` of every node, rad.
     """
-    count, one = len(angles), np.float32(1.0)
+    count = len(angles)
+    result = np.zeros((len(nodes), count), np.float32)
+    for i in prange(len(nodes)):
+        row = np.empty(count + 1, np.float32)
+        first = angles[0] + ridge[nodes[i]]
+        for motion in range(place.shape[1]):
+            up, along = share[i, motion]
+            _mixed(table, place[i, motion], strides, up, along, row)
+            sign = turned[i, motion, 0]
+            _rotated(row, angles, sign, sign * first + turned[i, motion, 1], result[i])
+    return result
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _root(needed, angles, sign, offset, direction, ahead, aside, drift, most):
+    """The largest root rho, at most `most`."""
+    distance = most
+    # From above, so that the largest root is found; `aside` is small beside the distance.
+    for _ in range(6):
+        turned = sign * (direction + math.atan2(aside, distance + ahead)) + offset
+        node, past, width = _cell(angles, turned)
+        wanted = needed[node] + past / width * (needed[node + 1] - needed[node]) + drift
+        if wanted >= most:
+            return most
+        distance = math.sqrt(max(wanted * wanted - aside * aside, 0.0)) - ahead
+    return distance
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+@no_type_check
+def evader_moves(
+    table,
+    after,
+    nodes,
+    spans,
+    control,
+    place,
+    strides,
+    share,
+    turned,
+    angles,
+    ridge,
+    moves,
+    drift,
+    most,
+    choice,
+):
+    """New rows of R for `nodes`, (n, angles).
+
+    **Arguments:** `after` (nodes, angles) R', m; pairs `spans[i, 0]` to `spans[i, 1]` are the velocities
+    `control` that node `nodes[i]` may choose, `moves` (controls, 2) m each in one period; `place`, `share`
+    and `turned` as for `pursuer_moves`, for every pair where R' has it; `drift` v_c T, m; `most`, m, stands
+    for every larger clearance; `choice` (nodes, angles), changed in place, the pair last found best.
+    """
+    count = len(angles)
     result = np.empty((len(nodes), count), np.float32)
     for i in prange(len(nodes)):
-        old = table[nodes[i]]
-        best = np.full(count, most, np.float32)
-        row = np.empty(count + 1, np.float32)
-        needed = np.empty(count + 1, np.float32)
-        direction = angles + ridge[nodes[i]]
-        cosine, sine = np.cos(direction), np.sin(direction)
-        for pair in range(spans[i, 0], spans[i, 1]):
-            needed[:] = 0.0
-            for motion in range(place.shape[1]):
-                low = place[pair, motion]
-                high = low + (strides[0] if low < strides[2] else strides[1])
-                up, along = share[pair, motion]
-                a, b = (one - up) * (one - along), (one - up) * along
-                c, d = up * (one - along), up * along
-                for k in range(count):
-                    lower = a * table[low, k] + b * table[low + 1, k]
-                    row[k] = lower + c * table[high, k] + d * table[high + 1, k]
-                row[count] = row[0]
-                sign = turned[pair, motion, 0]
-                _rotated(row, angles, sign, sign * direction[0] + turned[pair, motion, 1], needed)
-            needed[count] = needed[0]
-            x, y = moves[control[pair], 0], moves[control[pair], 1]
-            for k in range(count):
-                if best[k] <= old[k]:
-                    continue
-                ahead = cosine[k] * x + sine[k] * y
-                aside = cosine[k] * y - sine[k] * x
-                distance = best[k]
-                # From above, so that the largest root is found; `aside` is small beside the distance.
-                for _ in range(5):
-                    node, past, width = _cell(angles, angles[k] + math.atan2(aside, distance + ahead))
-                    wanted = needed[node] + past / width * (needed[node + 1] - needed[node]) + drift
-                    if wanted >= most:
-                        distance = most
-                        break
-                    distance = math.sqrt(max(wanted * wanted - aside * aside, 0.0)) - ahead
-                best[k] = min(best[k], np.float32(distance))
+        begin, pairs = spans[i, 0], spans[i, 1] - spans[i, 0]
+        rows = np.empty((pairs, count + 1), np.float32)
+        known = np.zeros(pairs, np.bool_)
         for k in range(count):
-            result[i, k] = max(best[k], old[k])
+            old = table[nodes[i], k]
+            direction = angles[k] + ridge[nodes[i]]
+            cosine, sine = math.cos(direction), math.sin(direction)
+            best, chosen = most, choice[nodes[i], k]
+            # The one last found best comes first: mostly it will do still.
+            for turn in range(pairs):
+                one = turn if turn != 0 else chosen
+                if turn == chosen and turn != 0:
+                    one = 0
+                pair = begin + one
+                if not known[one]:
+                    _mixed(after, place[pair], strides, share[pair, 0], share[pair, 1], rows[one])
+                    known[one] = True
+                x, y = moves[control[pair], 0], moves[control[pair], 1]
+                ahead, aside = cosine * x + sine * y, cosine * y - sine * x
+                root = _root(
+                    rows[one], angles, turned[pair, 0], turned[pair, 1], direction, ahead, aside, drift, most
+                )
+                if root < best:
+                    best, choice[nodes[i], k] = root, one
+                if best <= old:
+                    break
+            result[i, k] = max(np.float32(best), old)
     return result

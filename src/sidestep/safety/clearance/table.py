@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -15,7 +16,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, UInt16
 
 from sidestep import _interrupts
 from sidestep._arrays import AnyArray, Scalar
@@ -25,8 +27,12 @@ from sidestep.safety.clearance.grid import Angles, Grid, Spacing
 from sidestep.safety.clearance.solve import STAGES, Resolution, Solution, solve
 from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.scenario import Scenario
 
-_FORMAT = 1
+_FORMAT = 2
+STEP = 2e-5
+"""Unit (m) in which tables are kept: clearances are rounded up to it."""
+_FOLDER = Path(__file__).with_name("tables")
 _SAVE_SECONDS = 20.0
 
 
@@ -40,14 +46,16 @@ class ClearanceTable(eqx.Module):
 
     The table is the fixed point of the game in which the evader holds each velocity for a period, solved on a
     grid: it is computed, not proved (see `docs/theory.md`). R is interpolated between the nodes, never across
-    the surfaces at which the evader loses the choice of a side.
+    the surfaces at which the evader loses the choice of a side. R', `after` the evader's move and before the
+    pursuer's, is the largest R that a motion of the pursuer in one period leads to.
 
-    **Attributes:** `clearance` (nodes, angles) m; `ridge` (nodes,) rad, from which the angles of a row count;
-    `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed point, `change` the largest
-    in the last of them, m.
+    **Attributes:** `clearance`, `after` (nodes, angles) in units of `STEP`; `ridge` (nodes,) rad, from which
+    the angles of a row count; `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed
+    point, `change` the largest in the last of them, m.
     """
 
-    clearance: Float[Array, "n k"]
+    clearance: UInt16[Array, "n k"]
+    after: UInt16[Array, "n k"]
     ridge: Float[Array, "n"]
     game: ClearanceGame = eqx.field(static=True)
     grid: Grid = eqx.field(static=True)
@@ -59,7 +67,8 @@ class ClearanceTable(eqx.Module):
     def of(game: ClearanceGame, solution: Solution) -> ClearanceTable:
         """The table of a solution."""
         return ClearanceTable(
-            jnp.asarray(solution.clearance),
+            _counted(solution.clearance),
+            _counted(solution.after),
             jnp.asarray(solution.ridge, jnp.float32),
             game,
             solution.grid,
@@ -74,14 +83,19 @@ class ClearanceTable(eqx.Module):
         Piecewise smooth: derivatives are those of the cell that the state lies in. In the capture set R is
         that at its edge.
         """
-        place = self.grid.place(jnp, z[0], z[1])
+        return self._look(self.clearance, z[0], z[1], offset)
+
+    def _look(
+        self, rows: UInt16[Array, "n k"], ahead: Any, left: Any, offset: Float[AnyArray, "2"]
+    ) -> tuple[Scalar, Scalar]:
+        place = self.grid.place(jnp, ahead, left)
         node, weight = place.corners(jnp)
         direction = jnp.arctan2(offset[1], offset[0])
         turned = place.sign * direction + math.pi * place.turns - jnp.sum(weight * self.ridge[node])
         angle, along = self.directions.place(jnp, turned)
-        after = jnp.where(angle + 1 < self.directions.count, angle + 1, 0)
-        row = (1.0 - along) * self.clearance[node, angle] + along * self.clearance[node, after]
-        return place.height, jnp.sum(weight * row)
+        beyond = jnp.where(angle + 1 < self.directions.count, angle + 1, 0)
+        low, high = (rows[node, column].astype(weight.dtype) for column in (angle, beyond))
+        return place.height, STEP * jnp.sum(weight * (low + along * (high - low)))
 
     def margin(
         self,
@@ -114,10 +128,23 @@ class ClearanceTable(eqx.Module):
 
         return jnp.min(jax.vmap(after)(jnp.asarray(poses)))
 
+    def spare_after(
+        self,
+        z: Float[AnyArray, "2"],
+        offset: Float[AnyArray, "2"],
+        move: Float[AnyArray, "2"],
+        drift: Float[AnyArray, ""] | float,
+    ) -> Scalar:
+        """|p| - R (m) after a period, at least, whatever the pursuer does in it: `margin_after` by R',
+        without h', by one look into the table."""
+        ahead, moved = self.grid.nearer(jnp, z[0] + move[0]), offset + move
+        _, clearance = self._look(self.after, ahead, z[1] + move[1], moved)
+        return jnp.hypot(moved[0], moved[1]) - drift - clearance
+
     @property
     def farthest(self) -> float:
         """The largest R, m: obstacles beyond do not matter from any z with h' >= 0."""
-        return float(jnp.max(self.clearance))
+        return STEP * float(jnp.max(self.clearance))
 
     def save(self, path: str | Path) -> None:
         """Write the table to a file. **Raises** `OutputError` where that cannot be written."""
@@ -185,10 +212,30 @@ def clearance_table(
     return table
 
 
+def shipped_table(scenario: Scenario) -> ClearanceTable | None:
+    """The table that comes with sidestep and serves a scenario (see `ClearanceGame.refuses`), if any: of
+    several the one with the least clearance."""
+    serving = [table for table in _shipped() if not table.game.refuses(scenario)]
+    return min(serving, key=lambda table: table.farthest, default=None)
+
+
+@functools.cache
+def _shipped() -> tuple[ClearanceTable, ...]:
+    return tuple(ClearanceTable.load(path) for path in sorted(_FOLDER.glob("*.npz")))
+
+
+def _counted(clearance: np.ndarray) -> UInt16[Array, "n k"]:
+    """Clearances (m) in units of `STEP`, rounded up but for rounding errors."""
+    if clearance.dtype == np.uint16:
+        return jnp.asarray(clearance)
+    return jnp.asarray(np.ceil(clearance.astype(float) / STEP - 1e-3).astype(np.uint16))
+
+
 def _write(path: str | Path, solution: Solution | ClearanceTable, **about: Any) -> None:
     write_arrays(
         Path(path),
-        {"clearance": solution.clearance, "ridge": solution.ridge},
+        {"clearance": solution.clearance, "after": solution.after, "ridge": solution.ridge},
+        compressed=True,
         format=_FORMAT,
         grid=_plain(solution.grid),
         directions=_plain(solution.directions),
@@ -203,10 +250,10 @@ def _read(path: str | Path) -> tuple[Solution, dict[str, Any]]:
     arrays, about = read_named(Path(path))
     if about["format"] != _FORMAT:
         raise ValueError(f"format {about['format']}, not {_FORMAT}")
-    clearance, ridge = (arrays[f"['{name}']"] for name in ("clearance", "ridge"))
+    clearance, after, ridge = (arrays[f"['{name}']"] for name in ("clearance", "after", "ridge"))
     grid, directions = _grid(about["grid"]), Angles(*about["directions"])
     stage = about.get("stage", len(STAGES) - 1)
-    return Solution(grid, directions, ridge, clearance, stage, about["sweeps"], about["change"]), about
+    return Solution(grid, directions, ridge, clearance, after, stage, about["sweeps"], about["change"]), about
 
 
 def _plain(part: Any) -> Any:
@@ -215,5 +262,5 @@ def _plain(part: Any) -> Any:
 
 
 def _grid(values: list[Any]) -> Grid:
-    distance, angle, heights, shares, bearings, gap = values
-    return Grid(distance, angle, Spacing(*heights), Spacing(*shares), bearings, gap)
+    distance, angle, heights, shares, bearings, gap, reach = values
+    return Grid(distance, angle, Spacing(*heights), Spacing(*shares), bearings, gap, reach)
