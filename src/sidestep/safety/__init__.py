@@ -26,6 +26,7 @@ from sidestep.safety.filter import (
 )
 from sidestep.safety.shields import (
     BARRIERS,
+    JOINT_FORMS,
     PURSUIT_SHIELDS,
     SHIELDS,
     AdaptedShield,
@@ -37,6 +38,7 @@ from sidestep.safety.shields import (
     PaperShield,
     Shield,
     ShieldResult,
+    TableShield,
     as_shield,
     checked_shield,
     covered,
@@ -50,6 +52,7 @@ from sidestep.safety.shields import (
 
 __all__ = [
     "BARRIERS",
+    "JOINT_FORMS",
     "PURSUIT_SHIELDS",
     "SHIELDS",
     "AdaptedShield",
@@ -75,6 +78,7 @@ __all__ = [
     "Shield",
     "ShieldResult",
     "Status",
+    "TableShield",
     "as_shield",
     "certify",
     "checked_shield",

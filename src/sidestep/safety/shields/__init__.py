@@ -2,8 +2,10 @@
 
 from sidestep.safety.shields.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.shields.barrier_shield import BarrierShield, shield_of
+from sidestep.safety.shields.by_table import TableMemory, TableShield
 from sidestep.safety.shields.catalogue import (
     BARRIERS,
+    JOINT_FORMS,
     PURSUIT_SHIELDS,
     SHIELDS,
     as_shield,
@@ -19,6 +21,7 @@ from sidestep.safety.shields.shield import Shield, ShieldResult, filter_in_lanes
 
 __all__ = [
     "BARRIERS",
+    "JOINT_FORMS",
     "PURSUIT_SHIELDS",
     "SHIELDS",
     "AdaptedShield",
@@ -30,6 +33,8 @@ __all__ = [
     "PaperShield",
     "Shield",
     "ShieldResult",
+    "TableMemory",
+    "TableShield",
     "as_shield",
     "checked_shield",
     "covered",

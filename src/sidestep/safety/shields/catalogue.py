@@ -11,8 +11,10 @@ from sidestep.pursuit.game import CaptureGame
 from sidestep.safety.barriers.barrier import Barrier, ObstacleBarrier, RangeBarrier
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
+from sidestep.safety.clearance import ClearanceGame, clearance_table, shipped_table
 from sidestep.safety.shields.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.shields.barrier_shield import shield_of
+from sidestep.safety.shields.by_table import TableShield
 from sidestep.safety.shields.game import GameShield
 from sidestep.safety.shields.joint import JointShield
 from sidestep.safety.shields.none import NoShield
@@ -35,21 +37,28 @@ BARRIERS: dict[str, Barrier] = {
     "pursuit, velocity known": PursuitBarrier(known_velocity=True),
 }
 """Every barrier by name."""
-PURSUIT_SHIELDS = tuple(name for name, kind in SHIELDS.items() if kind.keeps_pursuit_barrier)
+JOINT_FORMS: dict[str, type[Shield]] = {"joint:look-ahead": JointShield, "joint:table": TableShield}
+"""The two forms of `joint` by name: `make_shield("joint", ...)` takes the second where it can."""
+PURSUIT_SHIELDS = tuple(name for name, kind in (SHIELDS | JOINT_FORMS).items() if kind.keeps_pursuit_barrier)
 """Shields whose rows towards pursuers are those of the pursuit barrier. These take a budget."""
 
 
 def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> Shield:
-    """The shield `name` (a key of `SHIELDS`) for a scenario; `budget` for those of `PURSUIT_SHIELDS` only.
+    """The shield `name` (a key of `SHIELDS` or `JOINT_FORMS`) for a scenario; `budget` for those of
+    `PURSUIT_SHIELDS` only.
 
-    For custom robots (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`.
+    For custom robots (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`. `joint` decides by the
+    clearance table that comes with sidestep for this scenario, if there is one and no budget is asked for,
+    otherwise by looking ahead. `joint:table` takes that table or the one that `clearance_table` keeps, and
+    solves for it, which takes minutes, where there is neither.
 
-    **Raises** `ValueError` naming the known shields, or what is wrong with the budget. **Warns**
+    **Raises** `ValueError` naming the known shields, or what is wrong with the budget, or why there is no
+    table. **Warns**
     `BudgetWarning` where the budget exceeds what the game allows, `ModelWarning` where custom robots leave an
     evader that can be captured.
     """
-    if name not in SHIELDS:
-        raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS))}")
+    if name not in SHIELDS | JOINT_FORMS:
+        raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS | JOINT_FORMS))}")
     if not scenario.built_in:
         covering = of_control_point(scenario)
         if name in PURSUIT_SHIELDS:
@@ -66,7 +75,13 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         budget.announce(scenario)
     if name == "game":
         return GameShield(scenario, budget, goes_round=True)
-    kind: Any = SHIELDS[name]
+    if name == "joint" and budget is None and not traced(scenario):
+        table = shipped_table(scenario)
+        if table is not None:
+            return TableShield(scenario, table)
+    if name == "joint:table":
+        return TableShield(scenario, shipped_table(scenario) or clearance_table(_game_of(scenario)))
+    kind: Any = (SHIELDS | JOINT_FORMS)[name]
     return kind(scenario, budget=budget) if name in PURSUIT_SHIELDS else kind(scenario)
 
 
@@ -107,5 +122,18 @@ def checked_shield(shield: Any) -> Shield:
 
 def name_of(shield: Shield, scenario: Scenario) -> str | None:
     """The name under which `make_shield` gives this very shield; None if there is none."""
-    kinds = [name for name, kind in SHIELDS.items() if type(shield) is kind]
-    return next((n for n in kinds if bool(eqx.tree_equal(shield, make_shield(n, scenario)))), None)
+    names = [name for name, kind in SHIELDS.items() if type(shield) is kind]
+    if isinstance(shield, TableShield):
+        # Compared without solving for a table.
+        if shipped_table(scenario) is None:
+            alike = eqx.tree_equal(shield, TableShield(scenario, shield.table))
+            return "joint:table" if bool(alike) and shield.table.game == _game_of(scenario) else None
+        names = ["joint"]
+    elif isinstance(shield, JointShield):
+        names = ["joint", "joint:look-ahead"]
+    return next((n for n in names if bool(eqx.tree_equal(shield, make_shield(n, scenario)))), None)
+
+
+def _game_of(scenario: Scenario) -> ClearanceGame:
+    """What `joint:table` solves for: what is to spare absorbs the table's interpolation."""
+    return ClearanceGame.of(scenario, spare=0.0015)

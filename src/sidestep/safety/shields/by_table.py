@@ -1,0 +1,251 @@
+"""The shield `joint` by a clearance table: no capture and no collision, at a look into it per velocity."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from sidestep._arrays import AnyArray, Scalar, norm, real, traced
+from sidestep.safety.barriers.barrier import BarrierRows
+from sidestep.safety.barriers.sampling_margin import with_margins
+from sidestep.safety.clearance.table import ClearanceTable
+from sidestep.safety.filter.projection import project
+from sidestep.safety.filter.status import Status
+from sidestep.safety.shields.answer import correction, known_parts
+from sidestep.safety.shields.game import GameShield
+from sidestep.safety.shields.going_round import next_turn, still_turned, turned
+from sidestep.safety.shields.masked_cond import masked_cond
+from sidestep.safety.shields.shield import Shield, ShieldResult
+from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.scenario import Scenario
+from sidestep.world.state import World
+
+_HEADINGS = 48
+_TURNS = 6
+"""Final headings of the pursuer's motions, to each side, for which h' is found."""
+_BACK = 8
+"""Steps from the velocity found back to the nominal one."""
+
+
+class TableMemory(eqx.Module):
+    """What the shield keeps from call to call: the `turn ()` that leads it round an obstacle, see
+    `going_round`."""
+
+    turn: Scalar
+
+
+class _Margins(eqx.Module):
+    """The evader's margins, m, and what is `known` of each pursuer and obstacle."""
+
+    towards_pursuers: Float[Array, "m"]
+    towards_obstacles: Float[Array, "k"]
+    known: Bool[Array, "n"]
+
+    @property
+    def least(self) -> Scalar:
+        both = jnp.concatenate([self.towards_pursuers, self.towards_obstacles])
+        return jnp.min(both, initial=jnp.inf, where=self.known)
+
+
+@final
+class TableShield(Shield):
+    """Keeps the evader where the table says that it can stay free of every pursuer and obstacle.
+
+    **Decision.** With the margin m, the least of
+
+        h'(z) - `spare_pursuer`  and  |p| - R(z, p) - `spare_obstacle`
+
+    over all pursuers and pairs, it takes the velocity nearest to the nominal one after which m is, whatever
+    the pursuers and obstacles do in the period, at least (1 - `gain` T) m. If there is none, it takes the
+    nearest with m >= 0 (to change the side of a pursuer's axis spends h'), and if there is none of these,
+    that with the largest m: its status is then `INFEASIBLE`. It chooses among 48 headings at full and at half
+    speed and a stop, then goes back towards the nominal velocity as far as it may.
+
+    **What holds.** For one pursuer and one obstacle what the table promises (see `ClearanceTable`): it is
+    computed, not proved. Several are kept by the worst of all pairs, which promises as much while no two
+    matter at once. An evader that is stuck behind an obstacle goes round it, see `going_round`.
+
+    The barriers reported are h' and |p| - R, m. The action carries the derivative of the nominal one where
+    that is accepted, else none; `rows_only` is the shield to learn through.
+
+    **Raises** `ValueError` for a table of another game.
+    """
+
+    scenario: Scenario
+    table: ClearanceTable
+    gain: Scalar = eqx.field(converter=real, default=4.0)
+    spare_pursuer: Scalar = eqx.field(converter=real, default=0.0005)
+    spare_obstacle: Scalar = eqx.field(converter=real, default=0.002)
+
+    def __check_init__(self) -> None:
+        if not traced(self.scenario) and (why := self.table.game.refuses(self.scenario)):
+            raise ValueError(f"the clearance table does not serve this scenario: {why}")
+
+    @property
+    def rows_only(self) -> GameShield:
+        return GameShield(self.scenario, nominal_picks_side=True)
+
+    @property
+    def looks_ahead(self) -> bool:
+        return False
+
+    def init(self, world: World) -> TableMemory:
+        return TableMemory(jnp.zeros_like(world.time))
+
+    def rows(self, world: World, memory: Any) -> BarrierRows:
+        game = self.rows_only
+        return game.rows(world, game.init(world))
+
+    def __call__(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
+    ) -> tuple[ShieldResult, TableMemory]:
+        nominal = jnp.asarray(nominal, world.evader.dtype)
+        if not self.scenario.obstacle_count:
+            return self._filtered(world, nominal, nominal), memory
+        kept = with_margins(self.scenario, None)
+        turn = still_turned(kept, world, nominal, memory.turn)
+        result = self._filtered(world, turned(nominal, turn), nominal)
+        towards_pursuers = result.barriers[: self.scenario.pursuer_count]
+        turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
+        turn = jnp.where(result.status == Status.INVALID, 0.0, turn)
+        return result, TableMemory(turn.astype(memory.turn.dtype))
+
+    def _filtered(self, world: World, wanted: Float[Array, "2"], nominal: Float[Array, "2"]) -> ShieldResult:
+        """The answer to `nominal`, in place of which `wanted` is tried."""
+        scenario, finite = self.scenario, jnp.all(jnp.isfinite(nominal))
+        known = known_parts(world)
+        everything = jnp.all(known)
+        none = jnp.zeros((0, 2), wanted.dtype)
+        limited = project(
+            jnp.where(everything, wanted, 0.0),
+            none,
+            none[:, 0],
+            scenario.evader_speed,
+            circle=scenario.action == "heading",
+        )
+        first = limited.action
+        arrays, fixed = eqx.partition(self, eqx.is_array)
+        now = self._margins(world)
+        least = now.least
+        aim = jnp.where(least > 0.0, (1.0 - self.gain * scenario.control_period) * least, least)
+        margin = self._margin_after(world, first)
+        accepted = margin >= aim
+
+        def choose(arrays: Any, world: World, first: Float[Array, "2"], aim: Scalar) -> Any:
+            return eqx.combine(arrays, fixed)._choose(world, first, aim)
+
+        start = jax.lax.stop_gradient((first, margin))
+        inputs = jax.lax.stop_gradient((arrays, world, first, aim))
+        action, margin = masked_cond(choose, ~accepted, start, *inputs, width=32)
+        action = jnp.where(accepted, first, action)
+        same = accepted & (limited.status == Status.OK) & jnp.all(wanted == nominal)
+        status = jnp.where(margin >= 0.0, jnp.where(same, Status.OK, Status.CORRECTED), Status.INFEASIBLE)
+        status = jnp.where(everything & finite, status, Status.INVALID)
+        barriers = jnp.concatenate([now.towards_pursuers, now.towards_obstacles])
+        return ShieldResult(
+            action=action,
+            status=status.astype(limited.status.dtype),
+            barriers=jnp.where(known, barriers, -jnp.inf),
+            slack=(margin - aim) / scenario.control_period,
+            intervention=correction(action, jnp.where(finite, nominal, 0.0)),
+        )
+
+    def _choose(self, world: World, first: Float[Array, "2"], aim: Scalar) -> tuple[Array, Scalar]:
+        """The velocity (m/s) in place of `first`, and the margin (m) after it."""
+        speed, circle = self.scenario.evader_speed, self.scenario.action == "heading"
+        heading = 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS
+        full = speed * jnp.asarray(np.stack([np.cos(heading), np.sin(heading)], -1), first.dtype)
+        # Along the tip's normals, where h' falls least.
+        tips = [self._tips(pose[2]) for pose in world.pursuers]
+        tips = [jnp.where(jnp.isfinite(tip), tip, 0.0) for tip in tips]
+        full = jnp.concatenate([full, *tips])
+        options = full if circle else jnp.concatenate([full, 0.5 * full, jnp.zeros((1, 2), first.dtype)])
+        after = jax.vmap(lambda option: self._margin_after(world, option))(options)
+        aim = jnp.where(jnp.any(after >= aim), aim, 0.0)
+        change = norm(options - first)
+        best = jnp.where(
+            jnp.any(after >= aim), jnp.argmin(jnp.where(after >= aim, change, jnp.inf)), jnp.argmax(after)
+        )
+        # Back towards the nominal velocity, as far as one step after the other still keeps the aim.
+        share = jnp.arange(1, _BACK).astype(first.dtype)[:, None] / _BACK
+        back = options[best] + share * (first - options[best])
+        if circle:
+            back = back * (speed / jnp.maximum(norm(back), 1e-6 * speed))[:, None]
+        back_after = jax.vmap(lambda option: self._margin_after(world, option))(back)
+        steps = jnp.sum(jnp.cumprod((back_after >= aim).astype(jnp.int32)))
+        moved = jnp.maximum(steps - 1, 0)
+        return (
+            jnp.where(steps > 0, back[moved], options[best]),
+            jnp.where(steps > 0, back_after[moved], after[best]),
+        )
+
+    def _tips(self, heading: Scalar) -> Float[Array, "4 2"]:
+        angle = self.table.game.angle
+        turns = np.array([angle, math.pi - angle, math.pi + angle, 2.0 * math.pi - angle])
+        towards = heading + jnp.asarray(turns, heading.dtype)
+        return self.scenario.evader_speed * jnp.stack([jnp.cos(towards), jnp.sin(towards)], -1)
+
+    def _margins(self, world: World) -> _Margins:
+        """h' less what is to spare towards each pursuer, and for each obstacle the least |p| - R, less the
+        same, over all pursuers."""
+        towards_obstacles = self._alone(world, jnp.zeros_like(world.evader))
+        heights = []
+        for pose in world.pursuers:
+            z = to_pursuer_frame(world.evader, pose)
+            heights.append(self.table.grid.height(jnp, z[0], z[1]) - self.spare_pursuer)
+            gaps = [
+                norm(p) - self.table(z, _turned_by(p, pose[2]))[1] - self.spare_obstacle
+                for p in world.evader - world.obstacles[:, :2]
+            ]
+            towards_obstacles = _at_most(towards_obstacles, gaps)
+        return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world))
+
+    def _margin_after(self, world: World, action: Float[Array, "2"]) -> Scalar:
+        """The margin (m) a period after `action` (m/s), whatever pursuers and obstacles do."""
+        period = self.scenario.control_period
+        move, drift = period * action, period * self._drift
+        towards_obstacles = self._alone(world, move) - drift
+        heights = []
+        motions = jnp.asarray(self.table.game.motions(_TURNS, 2), move.dtype)
+        for pose in world.pursuers:
+            z, moved = to_pursuer_frame(world.evader, pose), _turned_by(move, pose[2])
+            there = jnp.broadcast_to((z + moved)[:, None], (2, len(motions)))
+            seen = to_pursuer_frame(there, motions.T)
+            heights.append(jnp.min(self.table.grid.height(jnp, seen[0], seen[1])) - self.spare_pursuer)
+            gaps = [
+                self.table.spare_after(z, _turned_by(p, pose[2]), moved, drift) - self.spare_obstacle
+                for p in world.evader - world.obstacles[:, :2]
+            ]
+            towards_obstacles = _at_most(towards_obstacles, gaps)
+        return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world)).least
+
+    def _alone(self, world: World, move: Float[Array, "2"]) -> Float[Array, "k"]:
+        """What is left to every obstacle by itself, m, after the evader's `move`."""
+        return (
+            norm(world.evader + move - world.obstacles[:, :2])
+            - self.scenario.collision_distance
+            - self.spare_obstacle
+        )
+
+    @property
+    def _drift(self) -> Scalar:
+        return norm(self.scenario.obstacle_velocity)
+
+
+def _turned_by(vector: Float[Array, "2"], heading: Scalar) -> Float[Array, "2"]:
+    """A vector in the frame of a pursuer with that heading."""
+    return to_pursuer_frame(vector, jnp.stack([jnp.zeros_like(heading), jnp.zeros_like(heading), heading]))
+
+
+def _at_most(values: Float[Array, "k"], others: list[Scalar]) -> Float[Array, "k"]:
+    return jnp.minimum(values, jnp.stack(others)) if others else values
+
+
+def _stacked(values: list[Scalar], world: World) -> Float[Array, "m"]:
+    return jnp.stack(values) if values else jnp.zeros((0,), world.evader.dtype)
