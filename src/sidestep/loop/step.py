@@ -10,6 +10,7 @@ nominal velocity is constant in world axes. `control_step` is the rest and runs 
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -87,7 +88,8 @@ def control_step(
 ) -> tuple[World, Any, Events, Any, Float[Array, "m 2 *lanes"]]:
     """One control period: the shield filters `nominal`, the pursuers decide, the robots move.
 
-    Evader and pursuers decide simultaneously from the same world; neither knows the other's new command.
+    Evader and pursuers decide simultaneously from the same world; neither knows the other's new command, but
+    for a pursuer that `knows_velocity`: the worst that a sampled shield may meet.
 
     Many worlds may be stepped in lanes, with their axis last; on a CPU this is several times faster than
     `jax.vmap` over this function. Then `memory` and `key` have one entry per lane.
@@ -99,6 +101,9 @@ def control_step(
     `ShieldResult`, and the pursuers' commanded wheel speeds (m, 2) in m/s, see `pursue`.
     """
     result, memory = filter_in_lanes(shield, world, nominal, memory)
-    wheel_speeds = pursue(scenario, pursuer, world, key)
+    seen = world
+    if getattr(pursuer, "knows_velocity", False):
+        seen = eqx.tree_at(lambda world: world.evader_velocity, world, result.action)
+    wheel_speeds = pursue(scenario, pursuer, seen, key)
     moved, events = scenario.step(world, result.action, wheel_speeds)
     return moved, memory, events, result, wheel_speeds

@@ -34,6 +34,9 @@ class Pursuer(eqx.Module):
     """
 
     takes_lanes: ClassVar[bool] = False
+    knows_velocity: ClassVar[bool] = False
+    """Whether its world's `evader_velocity` is the one that the evader is about to drive, not the last one.
+    No real pursuer knows it; attacks do."""
     always_finite: ClassVar[bool] = False
     """Whether its answer is finite in every finite world; answers of others are checked, see `pursue`."""
 

@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from sidestep._arrays import AnyArray, Scalar, norm
 from sidestep.pursuit import PURSUERS, Pursuer, make_pursuer
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
+from sidestep.safety.clearance import ClearanceTable
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
-from sidestep.world.robots import wheels_from_body
+from sidestep.world.robots import drive, wheels_from_body
 
 _STAND_OFF = 0.1
 
@@ -158,6 +159,79 @@ class Sideswiper(Pursuer):
 def sideswiper(part: tuple[Float[Array, ""], Float[Array, ""]]) -> Sideswiper:
     """The `Sideswiper` of (patience, lead)."""
     return Sideswiper(*part)
+
+
+_EDGE = 16
+"""Wheel speeds per side of their square among which a saddle chooses."""
+_AFTERWARDS = 3
+"""Control periods that a saddle looks beyond the next one."""
+
+
+@final
+class JointSaddle(Pursuer):
+    """Leaves the evader the least margin a control period later, knowing the velocity that it is about to
+    drive.
+
+    The margin is that of a clearance table, min(h', |p| - R) over all obstacles, or without one min(h, |p| -
+    d). `pull` weighs, beside it, h and |p| by themselves: where the margin is the same it comes nearer. With
+    `two_steps` it takes what the best of 16 headings leaves three periods later, while the pursuer drives or
+    turns at full speed.
+    """
+
+    knows_velocity = True
+    table: ClearanceTable | None
+    pull: Float[Array, "*batch 2"]
+    two_steps: bool = eqx.field(static=True, default=False)
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
+        speed = scenario.pursuer_speed
+        ramp = jnp.linspace(-1.0, 1.0, _EDGE + 1)[:-1].astype(world.evader.dtype)
+        one = jnp.ones_like(ramp)
+        edges = [(ramp, one), (one, -ramp), (-ramp, -one), (-one, ramp)]
+        wheels = speed * jnp.concatenate([jnp.stack(edge, -1) for edge in edges])
+        period = scenario.control_period
+        obstacles = scenario.moved(world, world.evader_velocity, world.wheel_speeds).obstacles[:, :2]
+        evader = world.evader + period * world.evader_velocity
+
+        def after(wheels: Array) -> Scalar:
+            pose = drive(world.pursuer, wheels, scenario.pursuer_half_axle, period)
+            margin, h, gap = self._margin(scenario, evader, pose, obstacles)
+            if self.two_steps:
+                margin = self._answered(scenario, evader, pose, obstacles)
+            return margin + self.pull[0] * h + self.pull[1] * gap
+
+        return wheels[jnp.argmin(jax.vmap(after)(wheels))]
+
+    def _margin(
+        self, scenario: Scenario, evader: Array, pose: Array, obstacles: Array
+    ) -> tuple[Scalar, Scalar, Scalar]:
+        """The margin, h and the least |p|, m."""
+        z = to_pursuer_frame(evader, pose)
+        h = capture_set_distance(z, scenario.usable_angle, scenario.capture_distance)
+        offsets = evader - obstacles
+        gaps = norm(offsets)
+        gap = jnp.min(gaps, initial=1.0)
+        if self.table is None:
+            return jnp.minimum(h, gap - scenario.collision_distance), h, gap
+        margin = self.table.grid.height(jnp, z[0], z[1])
+        turn = pose.at[:2].set(0.0)
+        for offset in offsets:
+            margin = jnp.minimum(margin, self.table.margin(z, to_pursuer_frame(offset, turn)))
+        return margin, h, gap
+
+    def _answered(self, scenario: Scenario, evader: Array, pose: Array, obstacles: Array) -> Scalar:
+        duration = _AFTERWARDS * scenario.control_period
+        heading = jnp.arange(16) * (2.0 * jnp.pi / 16)
+        reached = scenario.evader_speed * duration * jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1)
+        corners = jnp.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], evader.dtype)
+        axle, speed = scenario.pursuer_half_axle, scenario.pursuer_speed
+        poses = jax.vmap(lambda corner: drive(pose, speed * corner, axle, duration))(corners)
+
+        def worst(move: Array) -> Scalar:
+            there = evader + move.astype(evader.dtype)
+            return jnp.min(jax.vmap(lambda pose: self._margin(scenario, there, pose, obstacles)[0])(poses))
+
+        return jnp.max(jax.vmap(worst)(reached))
 
 
 def _unit(offset: Float[AnyArray, "2"]) -> Float[Array, "2"]:

@@ -14,7 +14,16 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from sidestep._arrays import real
 from sidestep.learning import TD3
-from sidestep.trials.falsification.attackers import Roster, bang_bang, built_in, herder, script, sideswiper
+from sidestep.safety.clearance import ClearanceTable, shipped_table
+from sidestep.trials.falsification.attackers import (
+    JointSaddle,
+    Roster,
+    bang_bang,
+    built_in,
+    herder,
+    script,
+    sideswiper,
+)
 from sidestep.trials.falsification.chases import Chase, Target, run_from
 from sidestep.trials.falsification.cross_entropy import Search
 from sidestep.trials.falsification.learned import PursuerTraining, train, untrained
@@ -137,6 +146,35 @@ class Sideswiping(Attack):
         return None, _chased(target, sideswiper, (patience, lead), starts, self.periods, chase_key)
 
 
+@final
+class Saddles(Attack):
+    """`JointSaddle` by the clearance table of the shield or of the scenario, half of them from the edge of
+    the capture set."""
+
+    chases: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+    two_steps: bool = eqx.field(static=True)
+
+    def round(self, target: Target, goal: str, state: Any, key: PRNGKeyArray) -> tuple[Any, Round]:
+        start_key, chase_key, pull_key = jax.random.split(key, 3)
+        starts = _starts(target, start_key, self.chases, 0.5)
+        pull = jax.random.uniform(pull_key, (self.chases, 2), dtype=float) * jnp.array([0.1, 0.02])
+        table = getattr(target.shield, "table", None) or shipped_table(target.scenario)
+        saddle = _Saddle(table, self.two_steps)
+        return None, _chased(target, saddle, pull, starts, self.periods, chase_key)
+
+
+class _Saddle(eqx.Module):
+    """A call with a pull returns the `JointSaddle` with it."""
+
+    table: ClearanceTable | None
+    two_steps: bool = eqx.field(static=True)
+
+    def __call__(self, pull: Float[Array, "2"]) -> JointSaddle:
+        """The saddle with this `pull`."""
+        return JointSaddle(self.table, pull, self.two_steps)
+
+
 @eqx.filter_jit
 def _bang_bang_plans(scenario: Any, keys: Key[Array, "n"], periods: int, longest: Array) -> Array:
     return jax.vmap(lambda key: bang_bang(scenario, key, periods, longest))(keys)
@@ -201,7 +239,17 @@ class Learned(Attack):
         return state, _round(starts, chases, wheels)
 
 
-ATTACKS = ("pursuers", "bang-bang", "herder", "sideswipe", "cross-entropy", "edge", "learned")
+ATTACKS = (
+    "pursuers",
+    "bang-bang",
+    "herder",
+    "sideswipe",
+    "cross-entropy",
+    "edge",
+    "learned",
+    "joint-saddle",
+    "two-step",
+)
 """The names of all attacks, in the order of their turns."""
 
 
@@ -232,6 +280,8 @@ def make_attack(name: str, batch: int = 256, periods: int = 1200) -> Attack:
         return CrossEntropy(
             Planning(Search(48, 6, 3), drawn, 1, 24, 4, 32), few, min(periods, 160), edge=True
         )
+    if name in ("joint-saddle", "two-step"):
+        return Saddles(max(1, batch // 4), periods, name == "two-step")
     if name == "learned":
         algorithm = TD3(discount=0.97, actor_learning_rate=1e-3, critic_learning_rate=1e-3, hidden=(128, 128))
         chases = max(1, batch // 8)
