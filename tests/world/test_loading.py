@@ -105,7 +105,8 @@ def test_every_error_is_a_value_error():
 def test_unknown_scenario_lists_the_presets():
     with pytest.raises(
         ScenarioError,
-        match=r"no scenario 'papr': neither a preset \(paper, paper-test, paper-0\.10, paper-0\.15, quadrotor, quadrotor-test\) nor",
+        match=r"no scenario 'papr': neither a preset \(paper, paper-test, paper-0\.10, paper-0\.15, "
+        r"quadrotor, quadrotor-test\) nor",
     ):
         load_scenario("papr")
 
