@@ -56,6 +56,13 @@ class Certify:
     control period, errors and delay; task: the capture distance."""
     shield: bool = True
     """Also compute the clearance that the game shield keeps without a budget."""
+    obstacles: bool = False
+    """Also compute what can be kept from obstacles beside the pursuer. Takes minutes where no clearance table
+    for these robots comes with sidestep."""
+    obstacle: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
+    """An obstacle to check with --start: its centre in the pursuer's frame, m. Implies --obstacles."""
+    search_drift: bool = False
+    """Also search for the fastest drift of an obstacle that can be kept, for minutes. Implies --obstacles."""
     strict: bool = False
     """Exit status 1 unless capture is excluded (and, if asked, the start is certified)."""
     json: Path | None = None
@@ -90,7 +97,8 @@ def run(command: Certify, console: Console) -> int:
     fields = {name: value for name, value in overrides.items() if _MAY_BE_ZERO.get(name) not in given}
     robots = robot_fields(command.pursuer, command.evader)
     scenario = load_scenario(command.scenario, **{**robots, **fields})
-    start = None if command.start is None else _point(command.start)
+    start = None if command.start is None else _point("start", command.start)
+    obstacle = None if command.obstacle is None else _point("obstacle", command.obstacle)
     with RichConsole(stderr=True).status("certifying") as status:
         certificate = certify(
             scenario,
@@ -105,6 +113,9 @@ def run(command: Certify, console: Console) -> int:
             half_axle=given.get("half_axle"),
             control_period=given.get("control_period"),
             check_shield=command.shield,
+            obstacles=command.obstacles,
+            obstacle=obstacle,
+            search_drift=command.search_drift,
             mine=command.mine,
             progress=lambda what: status.update(f"certifying: {what}"),
         )
@@ -117,6 +128,12 @@ def run(command: Certify, console: Console) -> int:
 
         png, pdf = certificate_figure(certificate, command.figure)
         console.print(f"Figure: {png} and {pdf}", soft_wrap=True)
+        if certificate.obstacles is not None:
+            from sidestep.safety.certificate.obstacles import table_for
+            from sidestep.views import obstacle_figure
+
+            png, pdf = obstacle_figure(table_for(scenario), _beside(command.figure))
+            console.print(f"Obstacles: {png} and {pdf}", soft_wrap=True)
     sys.stdout.flush()
     certified = certificate.guaranteed and (
         certificate.start_margin is None or certificate.start_margin >= 0.0
@@ -129,12 +146,18 @@ def _figure_files(command: Certify) -> tuple[Path, ...]:
         return ()
     from sidestep.views.style import figure_files
 
-    return figure_files(command.figure)
+    more = command.obstacles or command.search_drift or command.obstacle is not None
+    return (*figure_files(command.figure), *(figure_files(_beside(command.figure)) if more else ()))
 
 
-def _point(text: str) -> tuple[float, float]:
+def _beside(figure: Path) -> Path:
+    """The path of the second figure, of obstacles."""
+    return figure.with_name(f"{figure.stem}-obstacles{figure.suffix}")
+
+
+def _point(name: str, text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"start = {text!r}: it must be two numbers X,Y in the pursuer's frame, m") from None
+        raise ValueError(f"{name} = {text!r}: it must be two numbers X,Y in the pursuer's frame, m") from None
     return x, y

@@ -7,6 +7,7 @@ from sidestep.views.clearance_figure import clearance_figure
 from sidestep.views.comparison import Section, comparison_sections, markdown_tables
 from sidestep.views.episode_report import write_episode_report
 from sidestep.views.intervention_figure import intervention_figure
+from sidestep.views.obstacle_figure import obstacle_figure
 from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
@@ -29,6 +30,7 @@ __all__ = [
     "intervention_figure",
     "load_run",
     "markdown_tables",
+    "obstacle_figure",
     "outcome_figure",
     "reward_figure",
     "safety_rows",

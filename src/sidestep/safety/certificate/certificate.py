@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from sidestep.safety.certificate.nearest_changes import Change, PairChange
+from sidestep.safety.certificate.obstacles import ObstacleClearance
 from sidestep.safety.certificate.shield_check import ShieldLevel
 from sidestep.safety.certificate.situation import Situation
 from sidestep.safety.certificate.survival import Survival
@@ -37,6 +38,9 @@ class Certificate:
     - `nearest_changes` of each parameter alone that would make it hold, `nearest_pairs` of two of mine
     - `grid_error`: how much the computed clearance may still be below the true one (it is never above)
     - `shield`: the level of the `game` shield, `survival` where the pursuer wins
+    - `obstacles`: what can be kept from an obstacle beside the pursuer, where asked for; or `no_obstacles`,
+    why
+      nothing can be said
     """
 
     situation: Situation
@@ -56,6 +60,8 @@ class Certificate:
     shield: ShieldLevel | None = None
     survival: Survival | None = None
     target_distance: float | None = None
+    obstacles: ObstacleClearance | None = None
+    no_obstacles: str | None = None
     claims: tuple[Claim, ...] = ()
 
     @property

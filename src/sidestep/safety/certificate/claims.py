@@ -180,14 +180,77 @@ def _obstacles(certificate: Certificate) -> list[Claim]:
             "Not even the row towards one obstacle alone: that needs an obstacle no faster than the evader "
             f"({drift:.3g} and {speed:.3g} m/s) and gain times period at most 1 (it is {share:.3g}).",
         )
-    together = (
-        "Pursuer and obstacles together: each row can be kept alone, both at once cannot always. A "
-        "pursuer can "
-        "pin the evader where one direction is safe and an obstacle lies in it. Where its row goes "
-        "first, what "
-        "is said about capture holds, and collisions are counted, not excluded."
+    return [claim, *_together(certificate)]
+
+
+def _together(certificate: Certificate) -> list[Claim]:
+    """Pursuer and obstacles at once."""
+    found = certificate.obstacles
+    if found is None:
+        text = (
+            "Pursuer and obstacles together: each row can be kept alone, both at once cannot always. A "
+            "pursuer can pin the evader where one direction is safe and an obstacle lies in it. Where its "
+            "row goes first, what is said about capture holds, and collisions are counted, not excluded."
+        )
+        if certificate.no_obstacles:
+            text += f" There is no clearance table here: {certificate.no_obstacles}."
+        return [Claim(NOT_CLAIMED, text)]
+    worst = max(found.directions, key=lambda direction: direction.worst)
+    text = (
+        f"Pursuer and one obstacle together: an evader outside the capture set (h' >= 0, design angle "
+        f"{math.degrees(found.game.angle):.3g} deg) that has every obstacle's centre farther than "
+        f"{found.beyond:.3g} m away stays free of both for ever, deciding every "
+        f"{found.game.control_period:g} s on exact measurements, while the obstacle drifts at up to "
+        f"{found.drift:.3g} m/s in any direction. Nearer ones matter by direction and h': most, "
+        f"{worst.worst:.3g} m at h' = {worst.height:g} m, where the obstacle lies "
+        f"{abs(math.degrees(worst.towards)):.0f} deg off the pursuer's axis. From a table solved on a grid "
+        "and interpolated, with spare drift for what that loses; not bounded between its nodes."
     )
-    return [claim, Claim(NOT_CLAIMED, together)]
+    claims = [Claim(COMPUTED, text)]
+    gaps = (
+        f"Several obstacles: while their centres stay at least {found.smallest_gap:.3g} m apart only one at "
+        "a time matters, and the same holds."
+    )
+    claims.append(Claim(COMPUTED, gaps))
+    if found.fastest_drift is not None:
+        claims.append(
+            Claim(
+                COMPUTED,
+                f"The fastest drift at which there is such a distance at all (below 1 m): "
+                f"{found.fastest_drift:.3g} m/s, on a coarse grid.",
+            )
+        )
+    claims += _start_and_obstacle(certificate)
+    measured = (
+        "How often an evader behind `joint` is lost to given pursuers and to the table's own worst case: "
+        "`sidestep falsify` counts that."
+    )
+    closer = "Obstacles that stand closer to each other than that, or to a wall."
+    return [*claims, Claim(MEASURED, measured), Claim(NOT_CLAIMED, closer)]
+
+
+def _start_and_obstacle(certificate: Certificate) -> list[Claim]:
+    found = certificate.obstacles
+    assert found is not None
+    if found.start_clearance is None or found.start_worst is None or found.start_height is None:
+        return []
+    if found.start_height < 0.0:
+        inside = f"it lies {-found.start_height:.3g} m inside the set to keep out of"
+        return [Claim(NOT_CLAIMED, f"Anything about obstacles from {certificate.start}: {inside}.")]
+    text = (
+        f"From {certificate.start} an obstacle must be at least {found.start_clearance:.3g} m away in the "
+        f"worst direction, {math.degrees(found.start_worst):.0f} deg from the pursuer's heading."
+    )
+    claims = [Claim(COMPUTED, text)]
+    if found.obstacle is not None and found.obstacle_margin is not None:
+        margin = found.obstacle_margin
+        if margin >= 0.0:
+            text = f"One at {found.obstacle} is {1e3 * margin:.3g} mm farther away than needed there."
+            claims.append(Claim(COMPUTED, text))
+        else:
+            text = f"That both can be kept with one at {found.obstacle}: {-1e3 * margin:.3g} mm are missing."
+            claims.append(Claim(NOT_CLAIMED, text))
+    return claims
 
 
 def _outside(certificate: Certificate) -> list[Claim]:

@@ -35,6 +35,7 @@ from sidestep.safety.certificate.nearest_changes import (
     nearest_changes,
     nearest_pairs,
 )
+from sidestep.safety.certificate.obstacles import obstacle_clearance
 from sidestep.safety.certificate.shield_check import shield_level
 from sidestep.safety.certificate.situation import Situation, plain, situation_of
 from sidestep.safety.certificate.survival import survival
@@ -67,6 +68,9 @@ def certify(
     half_axle: float | None = None,
     control_period: float | None = None,
     check_shield: bool = True,
+    obstacles: bool = False,
+    obstacle: tuple[float, float] | None = None,
+    search_drift: bool = False,
     mine: Collection[str] = MINE,
     progress: Callable[[str], None] | None = None,
 ) -> Certificate:
@@ -85,6 +89,10 @@ def certify(
     - `target_distance` m, used where the pursuer wins
     - `half_axle` m, `control_period` s, in place of the scenario's; they may be 0 here
     - `check_shield`: also compute what the shipped `game` shield keeps
+    - `obstacles`: also say what can be kept from obstacles, by the clearance table, which takes minutes where
+      none comes with sidestep; `obstacle` m, the place of one in the pursuer's frame to check with the
+      `start`
+    - `search_drift`: also search for the fastest drift of an obstacle that can be kept, for minutes
     - `mine`: what can be changed, of `nearest_changes.WHOSE` (evader, sensing, task, pursuer). These come
       first among the changes that would help, and are tried in pairs
     - `progress` gets, in words, what is computed next
@@ -96,11 +104,13 @@ def certify(
         ("position_error", position_error, DISTANCE), ("heading_error", heading_error, HEADING_ERROR),
         ("delay", delay, DELAY), ("tracking_error", tracking_error, TRACKING_ERROR),
         ("target_distance", target_distance, DISTANCE), ("half_axle", half_axle, DISTANCE),
-        ("control_period", control_period, DELAY), ("start", start, _PLACE),
+        ("control_period", control_period, DELAY), ("start", start, _PLACE), ("obstacle", obstacle, _PLACE),
     ):  # fmt: skip
         if value is not None:
             taken(name, value, bound)
     check_mine(mine)
+    if obstacle is not None and start is None:
+        raise ValueError(f"obstacle = {obstacle!r}: give the start, too, from which it is to be checked")
     situation = situation_of(scenario, half_axle, control_period, walls)
     game = replace(
         situation.game,
@@ -124,7 +134,32 @@ def certify(
         distance = plain(scenario.initial_separation)
         lasts = survival(game, situation.capture_distance, start, distance)
         certificate = replace(certificate, survival=lasts, target_distance=target_distance)
+    if obstacles or search_drift or obstacle is not None:
+        certificate = _with_obstacles(certificate, scenario, start, obstacle, search_drift, tell)
     return replace(certificate, claims=claims_of(certificate))
+
+
+def _with_obstacles(
+    certificate: Certificate,
+    scenario: Scenario,
+    start: tuple[float, float] | None,
+    obstacle: tuple[float, float] | None,
+    search_drift: bool,
+    tell: Callable[[str], None],
+) -> Certificate:
+    """The certificate with what can be kept from obstacles, or why nothing can be said."""
+    game = certificate.situation.game
+    if certificate.situation.walls or certificate.situation.pursuer_count != 1:
+        return replace(certificate, no_obstacles="it is computed for one pursuer in the open")
+    if any((game.position_error, game.heading_error, game.delay, game.tracking_error)):
+        return replace(certificate, no_obstacles="it is computed for exact measurements and motors")
+    try:
+        found = obstacle_clearance(
+            scenario, start=start, obstacle=obstacle, search_drift=search_drift, tell=tell
+        )
+    except ValueError as error:
+        return replace(certificate, no_obstacles=str(error))
+    return replace(certificate, obstacles=found)
 
 
 def _answer(situation: Situation, mine: Collection[str], tell: Callable[[str], None]) -> Certificate:

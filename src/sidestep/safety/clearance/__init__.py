@@ -1,10 +1,11 @@
 """How far away must an obstacle be? The table that answers it for pursuer and obstacle together."""
 
-from sidestep.safety.clearance.game import ClearanceGame
+from sidestep.safety.clearance.game import SPARE, ClearanceGame
 from sidestep.safety.clearance.solve import Resolution, Solution, solve
 from sidestep.safety.clearance.table import STEP, ClearanceTable, clearance_table, shipped_table
 
 __all__ = [
+    "SPARE",
     "STEP",
     "ClearanceGame",
     "ClearanceTable",

@@ -13,6 +13,10 @@ from sidestep.safety.sampled.sampled_design import COARSE, best_angle
 from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.world import Scenario
 
+SPARE = 0.0015
+"""How much farther (m) than by its drift an obstacle may come in a period in the tables that shields and
+certificates read: it absorbs what interpolation loses."""
+
 
 @dataclass(frozen=True)
 class ClearanceGame:

@@ -11,7 +11,7 @@ from sidestep.pursuit.game import CaptureGame
 from sidestep.safety.barriers.barrier import Barrier, ObstacleBarrier, RangeBarrier
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
-from sidestep.safety.clearance import ClearanceGame, clearance_table, shipped_table
+from sidestep.safety.clearance import SPARE, ClearanceGame, clearance_table, shipped_table
 from sidestep.safety.shields.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.shields.barrier_shield import shield_of
 from sidestep.safety.shields.by_table import TableShield
@@ -136,4 +136,4 @@ def name_of(shield: Shield, scenario: Scenario) -> str | None:
 
 def _game_of(scenario: Scenario) -> ClearanceGame:
     """What `joint:table` solves for: what is to spare absorbs the table's interpolation."""
-    return ClearanceGame.of(scenario, spare=0.0015)
+    return ClearanceGame.of(scenario, spare=SPARE)

@@ -1,0 +1,191 @@
+"""What can be said about obstacles beside the pursuer? Read off a clearance table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.safety.clearance import (
+    SPARE,
+    ClearanceGame,
+    ClearanceTable,
+    Resolution,
+    Solution,
+    clearance_table,
+    shipped_table,
+    solve,
+)
+from sidestep.safety.clearance.solve import STAGES
+from sidestep.world.scenario import Scenario
+
+HEIGHTS = (0.0, 0.01, 0.03, 0.06)
+"""Distances h' (m) from the capture set at which directions are reported."""
+BEARINGS = (0.0, 5.0, 30.0, 90.0)
+"""Bearings (deg) of the evader in the pursuer's frame at which they are."""
+_MOST = 1.0
+_COARSE = Resolution(
+    height=0.004, growth=1.4, share=0.02, share_growth=1.5, bearings=10, angles=64, ridge=0.05, headings=24,
+    turns=3,
+)  # fmt: skip
+_DRIFT_STEP = 0.005
+_SWEEPS = 400
+"""Sweeps after which a coarse table that still grows counts as one that never ends."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """The clearance (m) an obstacle needs from an evader that is `height` (m) outside the capture set at
+    `bearing` (rad) in the pursuer's frame: in the `best` and in the `worst` direction, and which that is,
+    `towards` (rad, from the pursuer's axis)."""
+
+    height: float
+    bearing: float
+    best: float
+    worst: float
+    towards: float
+
+
+@dataclass(frozen=True)
+class ObstacleClearance:
+    """What a clearance table says, in m and m/s.
+
+    - `beyond`: an obstacle whose centre is farther away than that does not matter, wherever the evader is
+    - `smallest_gap` between the centres of obstacles at which only one at a time can matter
+    - `drift` that the table is for; `fastest_drift` at which there still is one, on a coarse grid, or None
+      where it was not asked for
+    - `directions` see `Direction`
+    - `start_height` h' of the asked start, `start_clearance` that an obstacle must have from it in the
+      `start_worst` direction (rad); `obstacle_margin` of the asked obstacle; None where not asked
+    """
+
+    game: ClearanceGame
+    beyond: float
+    smallest_gap: float
+    drift: float
+    fastest_drift: float | None
+    directions: tuple[Direction, ...]
+    start_height: float | None = None
+    start_clearance: float | None = None
+    start_worst: float | None = None
+    obstacle: tuple[float, float] | None = None
+    obstacle_margin: float | None = None
+
+
+def table_for(scenario: Scenario, tell: Callable[[str], None] = lambda _: None) -> ClearanceTable:
+    """The table that comes with sidestep for a scenario, or the one kept from an earlier time, or solved for.
+
+    **Raises** `ValueError` where there is none, saying why.
+    """
+    shipped = shipped_table(scenario)
+    if shipped is not None:
+        return shipped
+
+    def progress(solution: Solution) -> None:
+        tell(
+            f"clearance table, {STAGES[solution.stage]}, sweep {solution.sweeps}, largest "
+            f"{float(np.max(solution.clearance)):.3f} m, last change {1e3 * solution.change:.2g} mm"
+        )
+
+    return clearance_table(ClearanceGame.of(scenario, spare=SPARE), progress=progress)
+
+
+def obstacle_clearance(
+    scenario: Scenario,
+    *,
+    start: tuple[float, float] | None = None,
+    obstacle: tuple[float, float] | None = None,
+    search_drift: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> ObstacleClearance:
+    """What can be kept from an obstacle beside one pursuer.
+
+    **Arguments:** `start` and `obstacle`, places in the pursuer's frame (m, x ahead, y left) to check;
+    `search_drift`: also search for the fastest drift, which takes minutes; `tell` gets, in words, what is
+    computed next.
+
+    **Raises** `ValueError` where there is no table, saying why.
+    """
+    table = table_for(scenario, tell)
+    game, period = table.game, float(scenario.control_period)
+    drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
+    found = ObstacleClearance(
+        game=game,
+        beyond=table.farthest,
+        smallest_gap=2.0 * (table.farthest + (game.evader_speed + drift) * period),
+        drift=drift,
+        fastest_drift=fastest_drift(game, drift, tell) if search_drift else None,
+        directions=tuple(_direction(table, h, math.radians(b)) for b in BEARINGS for h in HEIGHTS),
+    )
+    if start is None:
+        return found
+    z = np.asarray(start, float)
+    height = float(table.grid.height(np, z[0], z[1]))
+    _, worst, towards = _over_directions(table, z)
+    found = replace(found, start_height=height, start_clearance=worst, start_worst=towards)
+    if obstacle is None:
+        return found
+    offset = z - np.asarray(obstacle, float)
+    margin = float(table.margin(jnp.asarray(z), jnp.asarray(offset)))
+    return replace(found, obstacle=obstacle, obstacle_margin=margin)
+
+
+def fastest_drift(game: ClearanceGame, drift: float, tell: Callable[[str], None]) -> float:
+    """The fastest drift (m/s) at which a coarse table stays below 1 m, to 2 mm/s, by bisection from
+    `drift`."""
+    low, high = drift, game.evader_speed
+    while high - low > _DRIFT_STEP:
+        middle = (low + high) / 2.0
+        tell(f"the fastest drift: between {low:.3f} and {high:.3f} m/s")
+        tried = replace(game, obstacle_speed=middle + SPARE / game.control_period)
+        if _lasts(tried):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+class _Lost(Exception):
+    """Clearance grows on and on."""
+
+
+def _lasts(game: ClearanceGame) -> bool:
+    def watch(solution: Solution) -> None:
+        if float(np.max(solution.clearance)) >= 0.95 * _MOST or solution.sweeps >= _SWEEPS:
+            raise _Lost
+
+    try:
+        solve(game, _COARSE, most=_MOST, tolerance=5e-4, progress=watch)
+    except _Lost:
+        return False
+    return True
+
+
+def _direction(table: ClearanceTable, height: float, bearing: float) -> Direction:
+    game = table.game
+    distance = (game.capture_distance + height) / math.cos(max(game.angle - bearing, 0.0))
+    # Just off the axis: there the side is taken.
+    bearing = max(bearing, 1e-3)
+    z = distance * np.array([math.cos(bearing), math.sin(bearing)])
+    best, worst, towards = _over_directions(table, z)
+    return Direction(height, bearing, best, worst, towards)
+
+
+def clearances(table: ClearanceTable, z: np.ndarray, count: int = 720) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (rad) in which an obstacle lies from the evader at z (m), in the pursuer's frame, and the
+    clearance (m) that it needs there."""
+    towards = np.linspace(-math.pi, math.pi, count, endpoint=False)
+    # The table's direction is that from the obstacle to the evader.
+    offsets = -np.stack([np.cos(towards), np.sin(towards)], -1)
+    look = jax.vmap(lambda offset: table(jnp.asarray(z), offset)[1])
+    return towards, np.asarray(look(jnp.asarray(offsets)), float)
+
+
+def _over_directions(table: ClearanceTable, z: np.ndarray) -> tuple[float, float, float]:
+    towards, needed = clearances(table, z)
+    worst = int(np.argmax(needed))
+    return float(np.min(needed)), float(needed[worst]), float(towards[worst])
