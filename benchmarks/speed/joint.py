@@ -19,12 +19,19 @@ MOST_EPISODES = 1000
 
 
 def cases(quick: bool) -> list[Case]:
-    """The shield `joint`, and `game` beside it."""
+    """The shield `joint` in its two forms, and `game` beside it."""
     amount = {"seconds": 0.2, "decisions": 20} if quick else {"seconds": 20.0, "decisions": 20_000}
-    names = ["game"] if quick else ["joint", "game"]
+    kinds = {
+        "joint shield, looking ahead": ("joint:look-ahead", "paper"),
+        "joint shield, by its table": ("joint:table", "paper-0.15"),
+        "game shield": ("game", "paper"),
+    }
     return [
-        Case("joint", f"{name} shield", {"shield": name, **amount, "pursuer": PURSUER}, threads=1)
-        for name in names
+        Case(
+            "joint", name, {"shield": shield, "scenario": scenario, **amount, "pursuer": PURSUER}, threads=1
+        )
+        for name, (shield, scenario) in kinds.items()
+        if not (quick and shield == "joint:look-ahead")
     ]
 
 
@@ -40,7 +47,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     from speed.worlds import AHEAD
 
     synchronous_dispatch()
-    scenario = load_scenario("paper")
+    scenario = load_scenario(settings["scenario"])
     shield, pursuer = make_shield(settings["shield"], scenario), make_pursuer(PURSUER)
 
     @eqx.filter_jit

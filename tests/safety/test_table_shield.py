@@ -99,7 +99,7 @@ def test_the_nearest_velocity_that_keeps_the_margin_is_taken_among_all_it_may_ch
         angle, distance = generator.uniform(-math.pi, math.pi), generator.uniform(0.24, 0.6)
         obstacle = [0.22 + distance * math.cos(angle), 0.03 + distance * math.sin(angle)]
         world = world_of([0.22, 0.03], obstacle)
-        least = float(SHIELD._margins(world).least)
+        least = float(SHIELD.margin(world))
         if least < 0.0:
             continue
         nominal = 0.15 * np.array([math.cos(angle), math.sin(angle)])
@@ -193,7 +193,7 @@ def _chased(shield, drift, count=48, seconds=20.0):
             jnp.asarray(obstacle),
         ),
     )
-    least = jax.jit(jax.vmap(lambda world: SHIELD._margins(world).least))(worlds)
+    least = jax.jit(jax.vmap(lambda world: SHIELD.margin(world)))(worlds)
     some = np.flatnonzero(np.asarray(least) >= 0.0)[:count]
     worlds = jax.tree.map(lambda leaf: leaf[some], worlds)
     if isinstance(shield, TableShield):

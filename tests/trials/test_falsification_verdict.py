@@ -7,7 +7,7 @@ import pytest
 
 from sidestep.safety import Status
 from sidestep.trials.falsification import ASSUMPTIONS, certified_clearance, judge
-from sidestep.world import Scenario
+from sidestep.world import Scenario, load_scenario
 
 PAPER = Scenario()
 
@@ -54,6 +54,28 @@ def test_certificate_decides_how_deep_sampling_may_go(chase):
         verdict = judge(PAPER, "game", lost, guaranteed_clearance=guaranteed)
         assert verdict.inside
         assert verdict.assumption is None
+
+
+def test_a_shield_by_a_table_is_judged_by_the_table(chase):
+    scenario = load_scenario("paper-0.15")
+    lost = collision(chase(), infeasible=True)
+    start = jnp.asarray(lost.worlds.evader[0])
+
+    def with_obstacles(*places):
+        """Every world with obstacles there, relative to the start, at rest."""
+        robots = jnp.asarray([[*(start + jnp.asarray(place)), 0.0, 0.0] for place in places])
+        everywhere = jnp.broadcast_to(robots, (len(lost.worlds.evader), *robots.shape))
+        return eqx.tree_at(lambda t: t.worlds.obstacles, lost, everywhere)
+
+    assert judge(scenario, "joint", with_obstacles((0.201, 0.0))).assumption == "start"
+    assert judge(scenario, "joint", with_obstacles((0.0, 3.0))).assumption == "table"
+    two = load_scenario("paper-0.15", obstacle_count=2)
+    assert judge(two, "joint", with_obstacles((0.0, 3.0), (0.5, 3.0))).assumption == "gaps"
+    assert judge(two, "joint", with_obstacles((0.0, 3.0), (2.0, 3.0))).assumption == "table"
+    # Its other form keeps the rows.
+    assert judge(scenario, "joint:look-ahead", with_obstacles((0.0, 3.0))).assumption == "alone"
+    assert certified_clearance(scenario, "joint") is None
+    assert certified_clearance(scenario, "joint:look-ahead") is not None
 
 
 def test_what_a_shield_keeps_is_computed_only_where_it_promises_something():

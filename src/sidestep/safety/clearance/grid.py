@@ -49,11 +49,11 @@ class Spacing(NamedTuple):
 
     def place(self, xp: Any, value: Any) -> tuple[Any, Any]:
         """Cell and weight of its upper node; beyond the ends the weight is 0 or 1."""
-        growth = self.growth
-        index = xp.log1p(xp.maximum(value, 0.0) * (growth - 1.0) / self.first) / math.log(growth)
+        logarithm = math.log(self.growth)
+        index = xp.log1p(xp.maximum(value, 0.0) * ((self.growth - 1.0) / self.first)) / logarithm
         cell = xp.clip(xp.floor(index), 0, self.count - 2)
-        low = self.first * (growth**cell - 1.0) / (growth - 1.0)
-        weight = (value - low) / (self.first * growth**cell)
+        # What is left of the index, and so of value = first (growth^index - 1)/(growth - 1).
+        weight = _expm1((index - cell) * logarithm) / (self.growth - 1.0)
         return cell.astype(xp.int32), xp.clip(weight, 0.0, 1.0)
 
 
@@ -76,11 +76,29 @@ class Angles(NamedTuple):
     def place(self, xp: Any, angle: Any) -> tuple[Any, Any]:
         """Node at or below an angle, and the weight of the next one, which is the first after the last."""
         angle = angle - 2.0 * math.pi * xp.floor((angle + math.pi) / (2.0 * math.pi))
-        index = self.count // 2 + xp.arcsinh(angle / self.scale) / self.rate
+        part = angle / self.scale
+        index = self.count // 2 + xp.arcsinh(part) / self.rate
         node = xp.clip(xp.floor(index), 0, self.count - 1)
-        low = self.scale * xp.sinh(self.rate * (node - self.count // 2))
-        high = self.scale * xp.sinh(self.rate * (node + 1 - self.count // 2))
-        return node.astype(xp.int32), xp.clip((angle - low) / (high - low), 0.0, 1.0)
+        # Both nodes from the angle between them, by sinh(x - y) and sinh(x + y).
+        even, below, above = xp.sqrt(1.0 + part * part), index - node, node + 1.0 - index
+        low = part * _cosh(self.rate * below) - even * _sinh(self.rate * below)
+        high = part * _cosh(self.rate * above) + even * _sinh(self.rate * above)
+        return node.astype(xp.int32), xp.clip((part - low) / (high - low), 0.0, 1.0)
+
+
+def _expm1(x: Any) -> Any:
+    """e^x - 1 for 0 <= x <= 0.7, to 1e-6 of it. Like the next two quicker than a library's."""
+    return x * (1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7))))))
+
+
+def _sinh(x: Any) -> Any:
+    """sinh x for |x| <= 0.6, to 1e-6 of it."""
+    return x * (1 + x * x / 6 * (1 + x * x / 20 * (1 + x * x / 42)))
+
+
+def _cosh(x: Any) -> Any:
+    """cosh x for |x| <= 0.6, to 1e-6 of it."""
+    return 1 + x * x / 2 * (1 + x * x / 12 * (1 + x * x / 30))
 
 
 class Place(NamedTuple):
@@ -99,12 +117,21 @@ class Place(NamedTuple):
     sign: Any
     turns: Any
 
+    @property
+    def each(self) -> list[tuple[Any, Any]]:
+        """Node and weight of each of the cell's corners."""
+        up, along = self.up, self.along
+        return [
+            (self.node, (1.0 - up) * (1.0 - along)),
+            (self.node + 1, (1.0 - up) * along),
+            (self.node + self.stride, up * (1.0 - along)),
+            (self.node + self.stride + 1, up * along),
+        ]
+
     def corners(self, xp: Any) -> tuple[Any, Any]:
         """Nodes and weights of the cell's corners, (..., 4)."""
-        up, along = self.up, self.along
-        node = [self.node, self.node + 1, self.node + self.stride, self.node + self.stride + 1]
-        weight = [(1.0 - up) * (1.0 - along), (1.0 - up) * along, up * (1.0 - along), up * along]
-        return xp.stack(node, -1), xp.stack(weight, -1)
+        nodes, weights = zip(*self.each, strict=True)
+        return xp.stack(nodes, -1), xp.stack(weights, -1)
 
 
 class Grid(NamedTuple):

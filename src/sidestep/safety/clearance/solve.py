@@ -36,12 +36,12 @@ class Resolution:
     """
 
     height: float = bounded(0.0005, above=0.0, most=1.0, unit="m")
-    growth: float = bounded(1.1, above=1.0, most=10.0)
+    growth: float = bounded(1.1, above=1.0, most=2.0)
     farthest: float = bounded(0.25, above=0.0, most=1e3, unit="m")
     share: float = bounded(0.003, above=0.0, most=0.5)
-    share_growth: float = bounded(1.22, above=1.0, most=10.0)
+    share_growth: float = bounded(1.22, above=1.0, most=2.0)
     bearings: int = bounded(20, least=1, most=1000)
-    angles: int = bounded(288, least=8, most=4096)
+    angles: int = bounded(288, least=32, most=4096)
     ridge: float = bounded(0.012, above=0.0, most=1.0, unit="rad")
     headings: int = bounded(64, least=8, most=4096)
     turns: int = bounded(8, least=1, most=1000)

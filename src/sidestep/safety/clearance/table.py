@@ -88,14 +88,18 @@ class ClearanceTable(eqx.Module):
     def _look(
         self, rows: UInt16[Array, "n k"], ahead: Any, left: Any, offset: Float[AnyArray, "2"]
     ) -> tuple[Scalar, Scalar]:
-        place = self.grid.place(jnp, ahead, left)
-        node, weight = place.corners(jnp)
-        direction = jnp.arctan2(offset[1], offset[0])
-        turned = place.sign * direction + math.pi * place.turns - jnp.sum(weight * self.ridge[node])
-        angle, along = self.directions.place(jnp, turned)
+        # Without the barriers XLA computes places again for every corner.
+        place = jax.lax.optimization_barrier(self.grid.place(jnp, ahead, left))
+        # Corner by corner: twice as fast as one array of four.
+        middle = sum(weight * _taken(self.ridge, node) for node, weight in place.each)
+        turned = place.sign * jnp.arctan2(offset[1], offset[0]) + math.pi * place.turns - middle
+        angle, along = jax.lax.optimization_barrier(self.directions.place(jnp, turned))
         beyond = jnp.where(angle + 1 < self.directions.count, angle + 1, 0)
-        low, high = (rows[node, column].astype(weight.dtype) for column in (angle, beyond))
-        return place.height, STEP * jnp.sum(weight * (low + along * (high - low)))
+        clearance = jnp.zeros_like(turned)
+        for node, weight in place.each:
+            low, high = (_taken(rows, (node, column)).astype(turned.dtype) for column in (angle, beyond))
+            clearance = clearance + weight * (low + along * (high - low))
+        return place.height, STEP * clearance
 
     def margin(
         self,
@@ -222,6 +226,11 @@ def shipped_table(scenario: Scenario) -> ClearanceTable | None:
 @functools.cache
 def _shipped() -> tuple[ClearanceTable, ...]:
     return tuple(ClearanceTable.load(path) for path in sorted(_FOLDER.glob("*.npz")))
+
+
+def _taken(values: Array, index: Any) -> Array:
+    """values[index], for an index that is known to be in bounds."""
+    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _counted(clearance: np.ndarray) -> UInt16[Array, "n k"]:

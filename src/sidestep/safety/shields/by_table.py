@@ -27,7 +27,7 @@ from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
 _HEADINGS = 48
-_TURNS = 6
+_TURNS = 2
 """Final headings of the pursuer's motions, to each side, for which h' is found."""
 _BACK = 8
 """Steps from the velocity found back to the nominal one."""
@@ -98,6 +98,10 @@ class TableShield(Shield):
     def init(self, world: World) -> TableMemory:
         return TableMemory(jnp.zeros_like(world.time))
 
+    def margin(self, world: World) -> Scalar:
+        """The margin m (m) now: at least 0 where the evader can stay free of every pursuer and obstacle."""
+        return self._margins(world).least
+
     def rows(self, world: World, memory: Any) -> BarrierRows:
         game = self.rows_only
         return game.rows(world, game.init(world))
@@ -142,7 +146,7 @@ class TableShield(Shield):
 
         start = jax.lax.stop_gradient((first, margin))
         inputs = jax.lax.stop_gradient((arrays, world, first, aim))
-        action, margin = masked_cond(choose, ~accepted, start, *inputs, width=32)
+        action, margin = masked_cond(choose, ~accepted, start, *inputs, width=8)
         action = jnp.where(accepted, first, action)
         same = accepted & (limited.status == Status.OK) & jnp.all(wanted == nominal)
         status = jnp.where(margin >= 0.0, jnp.where(same, Status.OK, Status.CORRECTED), Status.INFEASIBLE)

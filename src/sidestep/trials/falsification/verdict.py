@@ -9,8 +9,9 @@ import numpy as np
 
 from sidestep.loop.rollout import Trajectory
 from sidestep.pursuit import CaptureGame
-from sidestep.safety import PURSUIT_SHIELDS, Status
+from sidestep.safety import PURSUIT_SHIELDS, Status, TableShield
 from sidestep.safety.certificate.shield_check import shield_level
+from sidestep.safety.clearance import ClearanceTable, shipped_table
 from sidestep.trials.captures import explain_capture
 from sidestep.trials.falsification.attackers import escape_margin
 from sidestep.world import Scenario, World
@@ -28,6 +29,8 @@ ASSUMPTIONS: dict[str, str] = {
     "rounding": "numbers are exact",
     "slow-obstacles": "obstacles are slower than the evader",
     "alone": "the rows towards pursuer and obstacles can be kept together",
+    "gaps": "obstacles stay so far apart that one at a time matters (the clearance table)",
+    "table": "between its nodes the clearance table is right",
 }
 """The assumptions of the shields' guarantees, by the names that verdicts use."""
 
@@ -67,11 +70,14 @@ def judge(
         raise ValueError(f"the episode ended '{outcome}', neither captured nor collided")
     if shield == "none":
         return Verdict("promise", "there is no shield")
-    if shield not in ("paper", *PURSUIT_SHIELDS):
+    table = _table(scenario, shield)
+    if table is None and shield not in ("paper", *PURSUIT_SHIELDS):
         return Verdict("promise", f"nothing is known of what the shield {shield!r} promises")
     common = _judge_input(scenario, trajectory)
     if common is not None:
         return common
+    if table is not None:
+        return _judge_table(scenario, table, trajectory)
     if outcome == "collided":
         return _judge_collision(scenario, shield, trajectory)
     if shield == "paper":
@@ -86,10 +92,38 @@ def certified_clearance(scenario: Scenario, shield: str) -> float | None:
     another shield, several pursuers, or a pursuer that wins the game. Takes seconds.
     """
     escapes = bool(CaptureGame.of(scenario).evader_can_escape)
-    if shield not in PURSUIT_SHIELDS or scenario.pursuer_count != 1 or not escapes:
+    by_rows = shield in PURSUIT_SHIELDS and _table(scenario, shield) is None
+    if not by_rows or scenario.pursuer_count != 1 or not escapes:
         return None
     kept = shield_level(scenario)
     return kept.level - kept.error - float(scenario.capture_distance)
+
+
+def _table(scenario: Scenario, shield: str) -> ClearanceTable | None:
+    """The clearance table that a shield of this name decides by."""
+    return shipped_table(scenario) if shield in ("joint", "joint:table") else None
+
+
+def _judge_table(scenario: Scenario, table: ClearanceTable, trajectory: Trajectory) -> Verdict:
+    start: World = jax.tree.map(lambda leaf: leaf[0], trajectory.worlds)
+    if scenario.pursuer_count != 1:
+        return Verdict("one-pursuer", f"there are {scenario.pursuer_count} pursuers")
+    margin = float(TableShield(scenario, table).margin(start))
+    if margin < 0.0:
+        return Verdict(
+            "start", f"it starts {-1e3 * margin:.3g} mm inside what its clearance table keeps free"
+        )
+    if scenario.obstacle_count > 1:
+        gap = 2.0 * (table.farthest + table.game.evader_speed * table.game.control_period)
+        places = np.asarray(trajectory.worlds.obstacles[:, :, :2])
+        apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
+        apart = np.where(np.eye(apart.shape[-1], dtype=bool), np.inf, apart)
+        if float(apart.min()) < gap:
+            words = (
+                f"two obstacles came within {apart.min():.3g} m of each other; its table is for {gap:.3g} m"
+            )
+            return Verdict("gaps", words)
+    return Verdict("table", "its clearance table is interpolated between its nodes, and not proved there")
 
 
 def _judge_input(scenario: Scenario, trajectory: Trajectory) -> Verdict | None:
