@@ -229,6 +229,7 @@ def _settle(
             driven.turned[due],
             angles,
             ridge,
+            game.obstacle_speed * game.control_period,
         )
         if change <= tolerance or (periods is not None and sweeps >= periods):
             break
@@ -248,7 +249,6 @@ def _settle(
             angles,
             ridge,
             moves,
-            game.obstacle_speed * game.control_period,
             most,
             choice,
         )

@@ -1,13 +1,17 @@
 """One sweep of the fixed point over the nodes of a clearance table, compiled by Numba.
 
-A period has two halves. Whatever the pursuer does in it, seen from where it then is, the obstacle must be as
-far away as the table says there. So after the evader's move, z and the direction phi of the obstacle given,
+A period has two halves. After the evader's move, z and the offset p given, the obstacle must be as far away
+as the table says whatever the pursuer and the obstacle do. The pursuer's motions w ask for
 
-    R'(z, phi) = max over motions w of R(z_w, phi_w),
+    max over w of R(z_w, phi_w),   phi the direction of p,
 
-and before it, among the velocities u that keep the pursuit barrier, one must lead where that is kept: at
-least rho away, the root along the ray phi of |rho e_phi + u T| - v_c T = R'(z + u T, direction of rho e_phi +
-u T). A node's new clearance R is the least such rho, or the old one if that is larger.
+and the obstacle, which drifts by up to v_c T in any direction, for so much more that p is outside that shape
+grown by v_c T: R'(z, phi). Before that, among the velocities u that keep the pursuit barrier, one must lead
+to where R' is kept: the obstacle must be at least rho away, the root along the ray phi of
+
+    |rho e_phi + u T| = R'(z + u T, direction of rho e_phi + u T).
+
+A node's new clearance R is the least such rho, or the old one if that is larger.
 """
 
 from __future__ import annotations
@@ -64,39 +68,66 @@ def _rotated(row, angles, sign, start, least):
         least[k] = max(least[k], value)
 
 
+_PARTS = 8
+"""Directions to each side in which a row is asked to grow it."""
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _grown(row, angles, drift, grown):
+    """The row of the shape |p| < row, grown by `drift` (m) in every direction."""
+    count = len(angles)
+    for k in range(count):
+        best = row[k] + drift
+        widest = drift / row[k]
+        for part in range(-_PARTS, _PARTS + 1):
+            turn = widest * part / _PARTS
+            node, past, width = _cell(angles, angles[k] + turn)
+            after = node + 1 if node + 1 < count else 0
+            radius = row[node] + np.float32(past / width) * (row[after] - row[node])
+            aside = radius * math.sin(turn)
+            if abs(aside) < drift:
+                reach = radius * math.cos(turn) + math.sqrt(drift * drift - aside * aside)
+                best = max(best, reach)
+        grown[k] = best
+
+
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def pursuer_moves(table, nodes, place, strides, share, turned, angles, ridge):
+def pursuer_moves(table, nodes, place, strides, share, turned, angles, ridge, drift):
     """R' in rows for `nodes`, (n, angles).
 
     **Arguments:** `table` (nodes, angles) R, m; for every one of `nodes` and motion `place` (n, motions) the
     first node of the cell it leads to, `share` (n, motions, 2) its weights upwards and along, and `turned`
     (n, motions, 2) the sign of phi there and its offset, less the ridge's angle; `strides`, upwards, in the
-    open region and the other, and the first node of that; `angles` of a row, rad; `ridge` of every node, rad.
+    open region and the other, and the first node of that; `angles` of a row, rad; `ridge` of every node, rad;
+    `drift` v_c T, m.
     """
     count = len(angles)
     result = np.zeros((len(nodes), count), np.float32)
     for i in prange(len(nodes)):
+        needed = np.zeros(count, np.float32)
         row = np.empty(count + 1, np.float32)
         first = angles[0] + ridge[nodes[i]]
         for motion in range(place.shape[1]):
             up, along = share[i, motion]
             _mixed(table, place[i, motion], strides, up, along, row)
             sign = turned[i, motion, 0]
-            _rotated(row, angles, sign, sign * first + turned[i, motion, 1], result[i])
+            _rotated(row, angles, sign, sign * first + turned[i, motion, 1], needed)
+        _grown(needed, angles, drift, result[i])
     return result
 
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _root(needed, angles, sign, offset, direction, ahead, aside, drift, most):
+def _root(needed, angles, sign, offset, direction, ahead, aside, most):
     """The largest root rho, at most `most`."""
     distance = most
     # From above, so that the largest root is found; `aside` is small beside the distance.
     for _ in range(6):
         turned = sign * (direction + math.atan2(aside, distance + ahead)) + offset
         node, past, width = _cell(angles, turned)
-        wanted = needed[node] + past / width * (needed[node + 1] - needed[node]) + drift
+        wanted = needed[node] + past / width * (needed[node + 1] - needed[node])
         if wanted >= most:
             return most
         distance = math.sqrt(max(wanted * wanted - aside * aside, 0.0)) - ahead
@@ -118,7 +149,6 @@ def evader_moves(
     angles,
     ridge,
     moves,
-    drift,
     most,
     choice,
 ):
@@ -126,7 +156,7 @@ def evader_moves(
 
     **Arguments:** `after` (nodes, angles) R', m; pairs `spans[i, 0]` to `spans[i, 1]` are the velocities
     `control` that node `nodes[i]` may choose, `moves` (controls, 2) m each in one period; `place`, `share`
-    and `turned` as for `pursuer_moves`, for every pair where R' has it; `drift` v_c T, m; `most`, m, stands
+    and `turned` as for `pursuer_moves`, for every pair where R' has it; `most`, m, stands
     for every larger clearance; `choice` (nodes, angles), changed in place, the pair last found best.
     """
     count = len(angles)
@@ -152,7 +182,7 @@ def evader_moves(
                 x, y = moves[control[pair], 0], moves[control[pair], 1]
                 ahead, aside = cosine * x + sine * y, cosine * y - sine * x
                 root = _root(
-                    rows[one], angles, turned[pair, 0], turned[pair, 1], direction, ahead, aside, drift, most
+                    rows[one], angles, turned[pair, 0], turned[pair, 1], direction, ahead, aside, most
                 )
                 if root < best:
                     best, choice[nodes[i], k] = root, one

@@ -29,7 +29,7 @@ from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.world.capture_geometry import to_pursuer_frame
 from sidestep.world.scenario import Scenario
 
-_FORMAT = 2
+_FORMAT = 3
 STEP = 2e-5
 """Unit (m) in which tables are kept: clearances are rounded up to it."""
 _FOLDER = Path(__file__).with_name("tables")
@@ -47,7 +47,8 @@ class ClearanceTable(eqx.Module):
     The table is the fixed point of the game in which the evader holds each velocity for a period, solved on a
     grid: it is computed, not proved (see `docs/theory.md`). R is interpolated between the nodes, never across
     the surfaces at which the evader loses the choice of a side. R', `after` the evader's move and before the
-    pursuer's, is the largest R that a motion of the pursuer in one period leads to.
+    pursuer's, is what then keeps R at the end of the period, whatever the pursuer does and however an
+    obstacle of the game's speed drifts in it.
 
     **Attributes:** `clearance`, `after` (nodes, angles) in units of `STEP`; `ridge` (nodes,) rad, from which
     the angles of a row count; `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed
@@ -101,15 +102,10 @@ class ClearanceTable(eqx.Module):
             clearance = clearance + weight * (low + along * (high - low))
         return place.height, STEP * clearance
 
-    def margin(
-        self,
-        z: Float[AnyArray, "2"],
-        offset: Float[AnyArray, "2"],
-        drift: Float[AnyArray, ""] | float = 0.0,
-    ) -> Scalar:
-        """min(h', |p| - R), m: at least 0 in the set that the evader keeps; with |p| less by `drift` (m)."""
+    def margin(self, z: Float[AnyArray, "2"], offset: Float[AnyArray, "2"]) -> Scalar:
+        """min(h', |p| - R), m: at least 0 in the set that the evader keeps."""
         height, clearance = self(z, offset)
-        return jnp.minimum(height, jnp.hypot(offset[0], offset[1]) - drift - clearance)
+        return jnp.minimum(height, jnp.hypot(offset[0], offset[1]) - clearance)
 
     def margin_after(
         self,
@@ -122,15 +118,19 @@ class ClearanceTable(eqx.Module):
         """The least `margin` (m) after a period, in the pursuer's frame at its beginning.
 
         **Arguments:** the evader moves by `move` (m), the pursuer to any of `poses` (m, m, rad), the obstacle
-        by up to `drift` (m) in any direction.
+        by `drift` (m) in any of 16 directions.
         """
-        place, moved = z + move, offset + move
+        place = z + move
+        angles = jnp.arange(16) * (jnp.pi / 8)
+        drifts = drift * jnp.stack([jnp.cos(angles), jnp.sin(angles)], -1)
 
-        def after(pose: Float[Array, "3"]) -> Scalar:
+        def after(pose: Float[Array, "3"], drifted: Float[Array, "2"]) -> Scalar:
             turn = pose.at[:2].set(0.0)
-            return self.margin(to_pursuer_frame(place, pose), to_pursuer_frame(moved, turn), drift)
+            moved = (offset + move - drifted).astype(turn.dtype)
+            return self.margin(to_pursuer_frame(place, pose), to_pursuer_frame(moved, turn))
 
-        return jnp.min(jax.vmap(after)(jnp.asarray(poses)))
+        every = jax.vmap(jax.vmap(after, in_axes=(None, 0)), in_axes=(0, None))
+        return jnp.min(every(jnp.asarray(poses), drifts))
 
     def spare_after(
         self,
@@ -139,11 +139,12 @@ class ClearanceTable(eqx.Module):
         move: Float[AnyArray, "2"],
         drift: Float[AnyArray, ""] | float,
     ) -> Scalar:
-        """|p| - R (m) after a period, at least, whatever the pursuer does in it: `margin_after` by R',
-        without h', by one look into the table."""
+        """|p| - R (m) after a period, at least, whatever the pursuer does in it: by R', without h', at one
+        look into the table. `drift` (m) of the obstacle in the period, at most that of the game."""
         ahead, moved = self.grid.nearer(jnp, z[0] + move[0]), offset + move
         _, clearance = self._look(self.after, ahead, z[1] + move[1], moved)
-        return jnp.hypot(moved[0], moved[1]) - drift - clearance
+        spare = self.game.obstacle_speed * self.game.control_period - drift
+        return jnp.hypot(moved[0], moved[1]) - clearance + spare
 
     @property
     def farthest(self) -> float:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sidestep._arrays import AnyArray, Scalar, norm, real, traced
+from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, traced
 from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.barriers.sampling_margin import with_margins
 from sidestep.safety.clearance.table import ClearanceTable
@@ -20,6 +20,7 @@ from sidestep.safety.filter.status import Status
 from sidestep.safety.shields.answer import correction, known_parts
 from sidestep.safety.shields.game import GameShield
 from sidestep.safety.shields.going_round import next_turn, still_turned, turned
+from sidestep.safety.shields.joint import JointMemory, JointShield
 from sidestep.safety.shields.masked_cond import masked_cond
 from sidestep.safety.shields.shield import Shield, ShieldResult
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -35,9 +36,10 @@ _BACK = 8
 
 class TableMemory(eqx.Module):
     """What the shield keeps from call to call: the `turn ()` that leads it round an obstacle, see
-    `going_round`."""
+    `going_round`, and the memory of the look-ahead where it is `crowded`, None for a shield without one."""
 
     turn: Scalar
+    crowded: JointMemory | None
 
 
 class _Margins(eqx.Module):
@@ -82,6 +84,7 @@ class TableShield(Shield):
     gain: Scalar = eqx.field(converter=real, default=4.0)
     spare_pursuer: Scalar = eqx.field(converter=real, default=0.0005)
     spare_obstacle: Scalar = eqx.field(converter=real, default=0.002)
+    crowded: JointShield | None = None
 
     def __check_init__(self) -> None:
         if not traced(self.scenario) and (why := self.table.game.refuses(self.scenario)):
@@ -93,10 +96,24 @@ class TableShield(Shield):
 
     @property
     def looks_ahead(self) -> bool:
-        return False
+        return self.crowded is not None
+
+    def plan(self, world: World, memory: TableMemory) -> Float[Array, "n 2"]:
+        return (
+            super().plan(world, memory) if self.crowded is None else self.crowded.plan(world, memory.crowded)
+        )
+
+    def filter_by_rows(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
+    ) -> tuple[ShieldResult, TableMemory]:
+        return self._by_table(world, jnp.asarray(nominal, world.evader.dtype), memory)
 
     def init(self, world: World) -> TableMemory:
-        return TableMemory(jnp.zeros_like(world.time))
+        crowded = None if self.crowded is None else self.crowded.init(world)
+        return TableMemory(jnp.zeros_like(world.time), crowded)
+
+    def has_plan(self, memory: TableMemory) -> Flag:
+        return jnp.zeros((), bool) if self.crowded is None else self.crowded.has_plan(memory.crowded)
 
     def margin(self, world: World) -> Scalar:
         """The margin m (m) now: at least 0 where the evader can stay free of every pursuer and obstacle."""
@@ -110,6 +127,34 @@ class TableShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
         nominal = jnp.asarray(nominal, world.evader.dtype)
+        if self.crowded is None:
+            return self._by_table(world, nominal, memory)
+        arrays, fixed = eqx.partition(self.crowded, eqx.is_array)
+        answer = self._by_table(world, nominal, memory)
+        # The look-ahead begins anew in every crowd.
+        waiting = eqx.tree_at(lambda part: part[1].crowded, answer, self.crowded.init(world))
+
+        def look(arrays: Any, world: World, nominal: Float[Array, "2"], memory: TableMemory) -> Any:
+            result, after = eqx.combine(arrays, fixed)(world, nominal, memory.crowded)
+            return result, TableMemory(jnp.zeros_like(memory.turn), after)
+
+        inputs = jax.lax.stop_gradient((arrays, world, nominal, memory))
+        crowd = self._is_crowded(world) & (answer[0].status != Status.INVALID)
+        result, after = masked_cond(look, crowd, jax.lax.stop_gradient(waiting), *inputs, width=4)
+        action = jnp.where(crowd, result.action, answer[0].action)
+        return eqx.tree_at(lambda result: result.action, result, action), after
+
+    def _is_crowded(self, world: World) -> Flag:
+        """Whether a second obstacle or pursuer is as near as those that the look-ahead minds."""
+        assert self.crowded is not None
+        near = self.crowded.near_obstacle
+        gaps = norm(world.obstacles[:, :2] - world.evader) - self.scenario.collision_distance
+        others = norm(world.pursuers[:, :2] - world.evader) - self.scenario.capture_distance
+        return (jnp.sum(gaps < near) > 1) | (jnp.sum(others < near) > 1)
+
+    def _by_table(
+        self, world: World, nominal: Float[Array, "2"], memory: TableMemory
+    ) -> tuple[ShieldResult, TableMemory]:
         if not self.scenario.obstacle_count:
             return self._filtered(world, nominal, nominal), memory
         kept = with_margins(self.scenario, None)
@@ -118,7 +163,7 @@ class TableShield(Shield):
         towards_pursuers = result.barriers[: self.scenario.pursuer_count]
         turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
         turn = jnp.where(result.status == Status.INVALID, 0.0, turn)
-        return result, TableMemory(turn.astype(memory.turn.dtype))
+        return result, TableMemory(turn.astype(memory.turn.dtype), memory.crowded)
 
     def _filtered(self, world: World, wanted: Float[Array, "2"], nominal: Float[Array, "2"]) -> ShieldResult:
         """The answer to `nominal`, in place of which `wanted` is tried."""

@@ -78,7 +78,9 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     if name == "joint" and budget is None and not traced(scenario):
         table = shipped_table(scenario)
         if table is not None:
-            return TableShield(scenario, table)
+            # Where two obstacles or pursuers matter at once the table promises nothing.
+            several = scenario.obstacle_count > 1 or scenario.pursuer_count > 1
+            return TableShield(scenario, table, crowded=JointShield(scenario) if several else None)
     if name == "joint:table":
         return TableShield(scenario, shipped_table(scenario) or clearance_table(_game_of(scenario)))
     kind: Any = (SHIELDS | JOINT_FORMS)[name]
@@ -128,7 +130,7 @@ def name_of(shield: Shield, scenario: Scenario) -> str | None:
         if shipped_table(scenario) is None:
             alike = eqx.tree_equal(shield, TableShield(scenario, shield.table))
             return "joint:table" if bool(alike) and shield.table.game == _game_of(scenario) else None
-        names = ["joint"]
+        names = ["joint", "joint:table"]
     elif isinstance(shield, JointShield):
         names = ["joint", "joint:look-ahead"]
     return next((n for n in names if bool(eqx.tree_equal(shield, make_shield(n, scenario)))), None)
