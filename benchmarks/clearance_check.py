@@ -84,7 +84,9 @@ def clopper_pearson(count: int, total: int, level: float = 0.95) -> tuple[float,
     )
 
 
-def summary(asked: dict[str, Any], shards: list[str], failed: list[dict[str, Any]], done: dict[str, Any]) -> Any:
+def summary(
+    asked: dict[str, Any], shards: list[str], failed: list[dict[str, Any]], done: dict[str, Any]
+) -> Any:
     """What the JSON holds."""
     total = done["boxes"]
     verified = total - len(failed)
@@ -137,7 +139,8 @@ def campaign(table: Path, options: argparse.Namespace) -> dict[str, Any]:
         done["seconds"] = before + time.perf_counter() - begun
         if done["boxes"] % _EVERY == 0 or done["boxes"] == len(numbers):
             print(
-                f"{done['boxes']} of {len(numbers)}: {done['boxes'] - len(failed)} verified, {done['seconds']:.0f} s",
+                f"{done['boxes']} of {len(numbers)}: {done['boxes'] - len(failed)} verified, "
+                f"{done['seconds']:.0f} s",
                 file=sys.stderr,
                 flush=True,
             )

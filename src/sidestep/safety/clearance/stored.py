@@ -20,7 +20,7 @@ OPEN, COMMITTED, ARC = range(3)
 _STEP, _FORMAT = 2e-5, 2
 
 
-def _index(spacing: list[float], value: Any) -> Any:
+def _index(spacing: Any, value: Any) -> Any:
     """Number of the node at a value, linear between nodes, for nodes first (g^i - 1)/(g - 1)."""
     first, growth, count = spacing
     value = np.maximum(value, 0.0)
@@ -44,12 +44,14 @@ class StoredTable:
                 raise ValueError(f"format {about['format']}, not {_FORMAT}")
             self.level, self.angle, self.heights, self.shares, self.bearings, self.gap, _ = about["grid"]
             (self.scale, self.count), self.game = about["directions"], dict(about["game"])
-            self.rows, self.ridge = _STEP * arrays["['clearance']"].astype(float), arrays["['ridge']"].astype(float)
+            self.rows = _STEP * arrays["['clearance']"].astype(float)
+            self.ridge = arrays["['ridge']"].astype(float)
             self.width = self.shares[2] + self.bearings
             shape = (self.heights[2] * (self.heights[2] + self.width), self.count)
             if self.rows.shape != shape or self.ridge.shape != shape[:1]:
                 raise ValueError(f"{self.rows.shape} clearances, not {shape}")
-            if not np.all(np.isfinite(self.ridge)) or np.min(self.rows) < self.game["collision_distance"] - 1e-6:
+            least = self.game["collision_distance"] - 1e-6
+            if not (np.all(np.isfinite(self.ridge)) and np.min(self.rows) >= least):
                 raise ValueError("a clearance is less than the collision distance")
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path} is no clearance table: {error!r}") from None
@@ -57,7 +59,8 @@ class StoredTable:
         self.period, self.evader = self.game["control_period"], self.game["evader_speed"]
         self.rate = 2.0 * math.asinh(math.pi / self.scale) / self.count
         self.nodes = nodes = self.scale * np.sinh(self.rate * (np.arange(self.count + 1) - self.count / 2))
-        self.slopes = np.max(np.abs(np.diff(self.rows, axis=1, append=self.rows[:, :1])) / np.diff(nodes), 1)
+        rises = np.diff(self.rows, axis=1, append=self.rows[:, :1])
+        self.slopes = np.max(np.abs(rises) / np.diff(nodes), 1)
 
     def _turn(self, angle: Any) -> Any:
         """Number of the node at an angle, linear between nodes, unwrapped."""
@@ -72,7 +75,8 @@ class StoredTable:
         if region == OPEN:
             return _index(self.heights, height), _index(self.heights, along)
         if region == COMMITTED:
-            length = self.level - (self.level + np.maximum(height, 0.0)) * math.cos(2.0 * self.angle) - self.gap
+            distance = self.level + np.maximum(height, 0.0)
+            length = self.level - distance * math.cos(2.0 * self.angle) - self.gap
             return _index(self.heights, height), _index(self.shares, (-self.gap - along) / length)
         bearing = (along - self.angle) / (math.pi / 2.0 - self.angle) * self.bearings
         return _index(self.heights, height), self.shares[2] - 1 + np.clip(bearing, 0.0, self.bearings)
@@ -94,23 +98,33 @@ class StoredTable:
                 clearance[mine] = values[:, 0]
         return height, clearance
 
-    def bounds(self, region: int, low: Any, high: Any, first: Any, last: Any, least: Any, most: Any) -> Any:
+    def bounds(
+        self, region: int, low: Any, high: Any, first: Any, last: Any, least: Any, most: Any
+    ) -> tuple[Any, Any, Any]:
         """R (m) at least and at most, and its largest slope in phi (m/rad) in all of these rows, over heights
         `low` to `high`, b or bearings `first` to `last` and directions `least` to `most`, (n,) each, in one
-        region; infinite where that is over too many nodes."""
+        region; NaN where that is over too many nodes."""
         corners = self._places(region, low, last if region == COMMITTED else first)
         opposite = self._places(region, high, first if region == COMMITTED else last)
         ends = [np.stack(pair, -1) for pair in zip(corners, opposite, strict=True)]
-        up, side = (
-            np.concatenate([part, np.clip(np.floor(part[:, :1]) + 1.0, part[:, :1], part[:, 1:])], 1) for part in ends
-        )
+        between = [np.clip(np.floor(part[:, :1]) + 1.0, part[:, :1], part[:, 1:]) for part in ends]
+        up, side = (np.concatenate(pair, 1) for pair in zip(ends, between, strict=True))
         values, steepness = self._values(region, up, side, least, most, 3)
-        return np.min(values, 1), np.max(values, 1), steepness
+        found = np.stack([np.min(values, 1), np.max(values, 1)])
+        wide = np.flatnonzero(np.isnan(found[0]))
+        if len(wide):  # Where the ridge is steep, over more angles.
+            parts = (part[wide] for part in (up, side, least, most))
+            values, _ = self._values(region, *parts, 3, 12)
+            found[:, wide] = np.min(values, 1), np.max(values, 1)
+        return found[0], found[1], steepness
 
-    def _values(self, region: int, up: Any, side: Any, least: Any, most: Any, count: int) -> tuple[Any, Any]:
+    def _values(
+        self, region: int, up: Any, side: Any, least: Any, most: Any, count: int, many: int = 4
+    ) -> tuple[Any, Any]:
         """R (m) at every pair of `up` and `side` (n, numbers), node numbers with the least first, and at the
-        ends of the angles and nodes between; NaN if more than `count` nodes a side. Largest slope, m/rad."""
-        nodes, most_angles = np.arange(count), np.arange(2 * count - 2)
+        ends of the angles and nodes between; NaN over more than `count` nodes a side or `many` angles. And
+        the largest slope in these rows, m/rad."""
+        nodes, angles = np.arange(count), np.arange(many if count > 2 else 2)
         size = self.heights[2] if region == OPEN else self.width
         i = np.minimum(np.floor(up[:, 0]), self.heights[2] - count)
         j = np.minimum(np.floor(side[:, 0]), size - count)
@@ -120,12 +134,12 @@ class StoredTable:
         ridge = np.einsum("nai,nij,nbj->nab", rise, self.ridge[node], run, optimize=True).reshape(len(i), -1)
         turned = np.stack([self._turn(least - np.max(ridge, 1)), self._turn(most - np.min(ridge, 1))])
         k = np.floor(turned[0])
-        inner = [np.clip(k + one, *turned) for one in most_angles[1:-1]]
+        inner = [np.clip(k + one, *turned) for one in angles[1:-1]]
         at = np.stack([*turned, *inner] if count > 2 else [turned[0]], -1)
-        column = (k[:, None].astype(int) + most_angles) % self.count
+        column = (k[:, None].astype(int) + angles) % self.count
         values = self.rows[node[..., None], column[:, None, None]]
         values = np.einsum("nai,nijk->najk", rise, values)
         values = np.einsum("nbj,najk->nabk", run, values)
-        values = np.einsum("nck,nabk->nabc", _hats(at, k, most_angles), values).reshape(len(i), -1)
-        fits = (up.max(1) <= i + count - 1) & (side.max(1) <= j + count - 1) & (turned[1] <= k + 2 * count - 3)
+        values = np.einsum("nck,nabk->nabc", _hats(at, k, angles), values).reshape(len(i), -1)
+        fits = (up.max(1) <= i + count - 1) & (side.max(1) <= j + count - 1) & (turned[1] <= k + angles[-1])
         return np.where(fits[:, None], values, np.nan), np.max(self.slopes[node], (1, 2))
