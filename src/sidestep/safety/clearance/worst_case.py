@@ -111,18 +111,28 @@ class WorstCase:
     def dip(self, start: Start, move: Any) -> float:
         """How much nearer (m) than l or d the robots may be within the period.
 
-        Along any unit vector n the pursuer comes at most A(s) while its wheels make s. A is convex: s C,
-        C the cosine to its axis, or more where turning to n pays. So n.(z + u t) - A(V t), which bounds the
-        distance, is least at an end of the period. |p + u t| - v_c t is least where its rate is 0.
+        Let the pursuer be turned by theta then. For any unit vector n it comes at most A(s) along n, where
+        s = V t - b |theta| >= 0 is left for driving: s C, with C the cosine to the nearest heading on the way,
+        or (s + 2 b C)^2/(8 b) where a detour pays, s > 2 b C. A is convex in t, so n.(z + u t) - A, which bounds
+        the distance, is least at s = 0 or t = T. For the obstacle, |p + u t| - v_c t is least where its rate
+        is 0.
         """
         table, collision = self.table, self.table.game["collision_distance"]
         angle = math.atan2(start.centre[1], start.centre[0]) + np.linspace(-1.2, 1.2, 481)
-        angle = np.append(angle, [table.angle, -table.angle])
-        n, cosine, sine = unit(angle), np.abs(np.cos(angle)), np.abs(np.sin(angle))
-        turned = (sine * self.reach + table.axle * cosine) ** 2 / (4.0 * table.axle * np.maximum(sine, 1e-9))
-        comes = np.where(sine * self.reach > table.axle * cosine, turned, self.reach * cosine)
-        begun = n @ start.centre - np.abs(n @ start.first) - np.abs(n @ start.second) - start.rest
-        pursuer = table.level - float(np.max(np.minimum(begun, begun + n @ move - comes)))
+        n = unit(np.append(angle, [table.angle, -table.angle]))
+        z = n @ start.centre - np.abs(n @ start.first) - np.abs(n @ start.second) - start.rest
+        pursuer = -math.inf
+        turns = np.linspace(0.0, self.reach / table.axle, 17)
+        for ends in np.stack([turns[:-1], turns[1:]], -1):
+            for way in (1.0, -1.0):
+                passed = unit(way * np.linspace(0.0, ends[1], 9))
+                # Between two headings it is larger than at both only where it is 1, and by less than this.
+                cosine = np.minimum(np.max(np.abs(n @ passed.T), 1) + (ends[1] / 8.0) ** 2 / 8.0, 1.0)
+                budget, twice = self.reach - table.axle * ends[0], 2.0 * table.axle * cosine
+                comes = np.where(budget > twice, (budget + twice) ** 2 / (8.0 * table.axle), budget * cosine)
+                turned = table.axle * ends / self.reach
+                begun = np.min(z[:, None] + turned * (n @ move)[:, None], 1)
+                pursuer = max(pursuer, table.level - float(np.max(np.minimum(begun, z + n @ move - comes))))
         p, long = start.least * unit(start.phi), math.hypot(*move)
         if long <= self.drifts:
             return max(pursuer, collision - start.least + long + self.drifts, 0.0)
