@@ -96,6 +96,7 @@ def test_a_good_box_is_verified_and_real_motions_keep_its_set(stored, box):
     wheels[::2] = speed * np.sign(wheels[::2])
     durations = period * generator.dirichlet(np.full(3, 0.4), count)
     poses = wheel_motions(wheels, durations, stored.game["half_axle"])
+    begins = np.concatenate([np.zeros((count, 1)), np.cumsum(durations, 1)[:, :-1]], 1)
     angle = generator.uniform(-math.pi, math.pi, count)
     drift = 0.02 * period * np.stack([np.cos(angle), np.sin(angle)], -1)
     for farther in (0.0, 0.001, 0.02):
@@ -103,6 +104,12 @@ def test_a_good_box_is_verified_and_real_motions_keep_its_set(stored, box):
         after, needed = stored.lookup(seen_from(z + move, poses), np.arctan2(p[:, 1], p[:, 0]) - poses[:, 2])
         assert np.min(after) >= 0.0
         assert np.min(np.hypot(*p.T) - needed) >= 0.0
+    for share in (0.2, 0.5, 0.8):
+        so_far = np.clip(share * period - begins, 0.0, durations)
+        place = wheel_motions(wheels, so_far, stored.game["half_axle"])[:, :2]
+        assert np.min(np.hypot(*(z + share * move - place).T)) >= stored.level - verdict.dip
+        p = clearance[:, None] * np.stack([np.cos(phi), np.sin(phi)], -1) + share * (move - drift)
+        assert np.min(np.hypot(*p.T)) >= stored.game["collision_distance"] - verdict.dip
 
 
 def test_a_table_that_asks_for_the_collision_distance_only_is_not_verified(stored):

@@ -111,11 +111,11 @@ class WorstCase:
     def dip(self, start: Start, move: Any) -> float:
         """How much nearer (m) than l or d the robots may be within the period.
 
-        Let the pursuer be turned by theta then. For any unit vector n it comes at most A(s) along n, where
-        s = V t - b |theta| >= 0 is left for driving: s C, with C the cosine to the nearest heading on the way,
-        or (s + 2 b C)^2/(8 b) where a detour pays, s > 2 b C. A is convex in t, so n.(z + u t) - A, which bounds
-        the distance, is least at s = 0 or t = T. For the obstacle, |p + u t| - v_c t is least where its rate
-        is 0.
+        Let the pursuer be turned by theta then. Along any unit vector n it comes at most A(s), where
+        s = V t - b |theta| >= 0 is left for driving: s C, with C the cosine to the nearest heading on the
+        way, or (s + 2 b C)^2/(8 b) where a detour pays, s > 2 b C. A is convex in t. So n.(z + u t) - A,
+        which bounds the distance, is least at s = 0 or t = T. For the obstacle, |p + u t| - v_c t is least
+        where its rate is 0.
         """
         table, collision = self.table, self.table.game["collision_distance"]
         angle = math.atan2(start.centre[1], start.centre[0]) + np.linspace(-1.2, 1.2, 481)
