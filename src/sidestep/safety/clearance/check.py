@@ -31,11 +31,12 @@ class Box(NamedTuple):
 
     def halves(self, table: StoredTable) -> tuple[Box, Box]:
         """Cut across the side along which R changes most."""
-        middles = tuple((sum(part) / 2.0,) * 2 for part in self[1:])
-        sides = [[*middles[:k], part, *middles[k + 1 :]] for k, part in enumerate(self[1:])]
+        whole = self.height, self.along, self.phi
+        middles = tuple((sum(part) / 2.0,) * 2 for part in whole)
+        sides = [[*middles[:k], part, *middles[k + 1 :]] for k, part in enumerate(whole)]
         least, most, _ = table.bounds(self.region, *np.array(sides).reshape(3, 6).T)
         side = int(np.argmax(most - least))
-        name, (low, high), middle = self._fields[side + 1], self[side + 1], middles[side][0]
+        name, (low, high), middle = self._fields[side + 1], whole[side], middles[side][0]
         return self._replace(**{name: (low, middle)}), self._replace(**{name: (middle, high)})
 
     def start(self, table: StoredTable) -> Start:

@@ -113,8 +113,7 @@ class StoredTable:
         found = np.stack([np.min(values, 1), np.max(values, 1)])
         wide = np.flatnonzero(np.isnan(found[0]))
         if len(wide):  # Where the ridge is steep, over more angles.
-            parts = (part[wide] for part in (up, side, least, most))
-            values, _ = self._values(region, *parts, 3, 12)
+            values, _ = self._values(region, up[wide], side[wide], least[wide], most[wide], 3, 12)
             found[:, wide] = np.min(values, 1), np.max(values, 1)
         return found[0], found[1], steepness
 
