@@ -9,8 +9,7 @@ largest difference from the finest table at random states, and the share of rand
 period against pursuer motions four times as dense as those solved for, with how far the worst of them
 falls out of it.
 
-The table is solved for a drift of `--solved-drift`, larger than the true one, `--drift`: what is to spare
-absorbs the interpolation.
+The table asks for `--spare` more after every period, which absorbs the interpolation.
 """
 
 from __future__ import annotations
@@ -27,24 +26,24 @@ import jax.numpy as jnp
 import numpy as np
 
 import sidestep
-from sidestep.safety.clearance import ClearanceGame, ClearanceTable, Resolution, solve
+from sidestep.safety.clearance import SPARE, ClearanceGame, ClearanceTable, Resolution, solve
 from sidestep.store.files import write_json
 
 RESOLUTIONS = {
     "coarse": Resolution(
         height=0.002, growth=1.25, share=0.01, share_growth=1.35, bearings=12, angles=96, ridge=0.025, turns=4
     ),
-    "middle": Resolution(
-        height=0.001,
-        growth=1.15,
-        share=0.004,
-        share_growth=1.25,
-        angles=144,
-        ridge=0.014,
-        headings=48,
-        turns=6,
-    ),
     "default": Resolution(),
+    "fine": Resolution(
+        height=0.0005,
+        growth=1.1,
+        share=0.003,
+        share_growth=1.22,
+        angles=288,
+        ridge=0.012,
+        headings=64,
+        turns=8,
+    ),
 }
 BATCH = 512
 
@@ -130,15 +129,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--capture-distance", type=float, default=0.15)
-    parser.add_argument("--solved-drift", type=float, default=0.05)
+    parser.add_argument("--spare", type=float, default=SPARE)
     parser.add_argument("--drift", type=float, default=0.02)
     parser.add_argument("--states", type=int, default=20_000)
     parser.add_argument("--resolutions", nargs="*", choices=RESOLUTIONS, default=list(RESOLUTIONS))
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     scenario = sidestep.load_scenario("paper", capture_distance=asked.capture_distance)
-    spare = (asked.solved_drift - asked.drift) * float(scenario.control_period)
-    game = ClearanceGame.of(scenario, spare=spare)
+    game = ClearanceGame.of(scenario, spare=asked.spare)
     results: dict[str, Any] = {"game": game.as_dict, "true drift, m/s": asked.drift, "tables": {}}
     finest = None
     for name in reversed(asked.resolutions):

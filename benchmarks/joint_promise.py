@@ -185,14 +185,10 @@ def main() -> None:
         )
         # Whatever happens at the target, the chase goes on.
         scenario = eqx.tree_at(lambda s: s.reach_distance, scenario, jnp.asarray(-1.0))
-        inside = TableShield(scenario, table)
+        inside, shield = TableShield(scenario, table), make_shield(asked.shield, scenario)
+        # Behind the shield's back.
         scenario = eqx.tree_at(
             lambda s: s.obstacle_velocity, scenario, asked.faster * scenario.obstacle_velocity
-        )
-        shield = (
-            make_shield(asked.shield, scenario)
-            if asked.shield != "joint"
-            else eqx.tree_at(lambda s: s.scenario, inside, scenario)
         )
         closing = float(scenario.evader_speed + norm(scenario.obstacle_velocity))
         gap = asked.closer * 2.0 * (table.farthest + closing * float(scenario.control_period))

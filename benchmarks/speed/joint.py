@@ -27,9 +27,7 @@ def cases(quick: bool) -> list[Case]:
         "game shield": ("game", "paper"),
     }
     return [
-        Case(
-            "joint", name, {"shield": shield, "scenario": scenario, **amount, "pursuer": PURSUER}, threads=1
-        )
+        Case("joint", name, {"shield": shield, "scenario": scenario, **amount, "pursuer": PURSUER}, threads=1)
         for name, (shield, scenario) in kinds.items()
         if not (quick and shield == "joint:look-ahead")
     ]

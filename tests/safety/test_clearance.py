@@ -24,8 +24,8 @@ from sidestep.safety.clearance.grid import Angles, Spacing
 from sidestep.world import load_scenario
 from sidestep.world.capture_geometry import to_pursuer_frame
 
-# Solved for a larger drift than the true one: what is to spare absorbs the interpolation.
-GAME = ClearanceGame(0.1574, 0.2, 0.2, 0.1, 0.2, 0.05, 0.05, math.radians(44.0))
+# What is to spare absorbs the interpolation.
+GAME = ClearanceGame(0.1574, 0.2, 0.2, 0.1, 0.2, 0.02, 0.05, 0.0015, math.radians(44.0))
 COARSE = Resolution(
     height=0.003, growth=1.35, share=0.02, share_growth=1.5, bearings=10, angles=72, ridge=0.03, headings=24,
     turns=3,
@@ -135,7 +135,7 @@ def test_longer_asks_for_more_and_no_time_for_nothing(solution):
     largest = [float(np.max(one.clearance)) for one in (*tables, solution)]
     assert largest[0] < largest[1] < largest[2] < largest[3] < 0.5
     # Each period can ask for no more than both robots can come nearer in it.
-    closing = (GAME.evader_speed + GAME.obstacle_speed) * GAME.control_period
+    closing = (GAME.evader_speed + GAME.obstacle_speed) * GAME.control_period + GAME.spare
     assert largest[1] <= GAME.collision_distance + 5 * closing
 
 
@@ -178,7 +178,7 @@ def test_a_scenario_names_its_game_and_one_without_a_table_is_refused():
     with pytest.raises(ValueError, match=r"no design angle keeps the pursuer 0\.2 m away"):
         ClearanceGame.of(load_scenario("paper"))
     with pytest.raises(ValueError, match="no velocity keeps the pursuit barrier"):
-        solve(ClearanceGame(0.1574, 0.2, 0.2, 0.2, 0.2, 0.02, 0.05, math.radians(44.0)), COARSE)
+        solve(ClearanceGame(0.1574, 0.2, 0.2, 0.2, 0.2, 0.02, 0.05, 0.0, math.radians(44.0)), COARSE)
     with pytest.raises(ValueError, match=r"resolution: growth = 1\.0: it must be"):
         solve(GAME, Resolution(growth=1.0))
     with pytest.raises(ValueError, match="angles = 99: it must be even"):

@@ -47,6 +47,28 @@ def test_joint_takes_the_table_where_one_is_shipped_and_looks_ahead_elsewhere():
     assert isinstance(make_shield("joint", easier), TableShield)
 
 
+def test_in_a_crowd_joint_looks_ahead_and_elsewhere_it_goes_by_the_table():
+    scenario = load_scenario("paper-0.15", obstacle_count=2)
+    joint = make_shield("joint", scenario)
+    forms = {name: make_shield(name, scenario) for name in ("joint:table", "joint:look-ahead")}
+    assert forms["joint:table"].crowded is None
+    assert joint.looks_ahead
+    nominal = jnp.array([0.1574, 0.0])
+
+    def answers(second):
+        world = eqx.tree_at(
+            lambda w: w.obstacles, PINNED, jnp.concatenate([PINNED.obstacles, jnp.asarray([second])])
+        )
+        return {name: ASK(shield, world, nominal) for name, shield in {"joint": joint, **forms}.items()}
+
+    crowd = answers([0.5, -0.45, 0.0, 0.0])
+    np.testing.assert_allclose(crowd["joint"].action, crowd["joint:look-ahead"].action, atol=1e-6)
+    assert np.linalg.norm(np.asarray(crowd["joint"].action - crowd["joint:table"].action)) > 1e-3
+    alone = answers([5.0, -0.45, 0.0, 0.0])
+    np.testing.assert_allclose(alone["joint"].action, alone["joint:table"].action, atol=1e-6)
+    assert int(alone["joint"].status) == Status.CORRECTED
+
+
 def test_names_lead_back_to_the_same_shield():
     assert name_of(SHIELD, SCENARIO) == "joint"
     assert name_of(make_shield("joint:look-ahead", SCENARIO), SCENARIO) == "joint:look-ahead"
@@ -61,7 +83,7 @@ def test_names_lead_back_to_the_same_shield():
         ({"pursuer_speed": 0.25}, r"pursuer_speed is 0\.25, the table's 0\.2"),
         ({"capture_distance": 0.16}, r"capture_distance is 0\.16, the table's 0\.15"),
         ({"control_period": 0.1}, r"control_period is 0\.1, the table's 0\.05"),
-        ({"obstacle_velocity": (0.06, 0.0)}, r"obstacle_speed is 0\.06, the table's 0\.05"),
+        ({"obstacle_velocity": (0.03, 0.0)}, r"obstacle_speed is 0\.03, the table's 0\.02"),
         ({"action": "heading"}, "its evader cannot stop"),
     ],
 )
@@ -144,11 +166,12 @@ def test_any_number_of_robots(pursuers, obstacles):
     scenario = load_scenario("paper-0.15", pursuer_count=pursuers, obstacle_count=obstacles)
     shield = make_shield("joint", scenario)
     assert isinstance(shield, TableShield)
-    result = evaluate(scenario, goal_seeking, shield, "nash", 40, jax.random.key(0))
-    assert result.collided == 0
-    if pursuers < 2:
-        assert result.safe == 40
-        assert result.reached >= 38
+    assert (shield.crowded is None) == (pursuers + obstacles < 3)
+    if obstacles < 3:
+        count = 40 if shield.crowded is None else 4
+        result = evaluate(scenario, goal_seeking, shield, "nash", count, jax.random.key(0))
+        assert result.safe == count
+        assert result.reached >= 0.9 * count
     worlds = jax.vmap(scenario.reset)(jax.random.split(jax.random.key(1), 3))
     nominal = jnp.full((3, 2), 0.1)
     together = jax.vmap(lambda w, n: shield(w, n, shield.init(w))[0])(worlds, nominal)
@@ -197,6 +220,7 @@ def _chased(shield, drift, count=48, seconds=20.0):
     some = np.flatnonzero(np.asarray(least) >= 0.0)[:count]
     worlds = jax.tree.map(lambda leaf: leaf[some], worlds)
     if isinstance(shield, TableShield):
+        # Too fast a drift for the table is tried too.
         shield = eqx.tree_at(lambda s: s.scenario, shield, scenario)
     target = Target(scenario, goal_seeking, shield)
     pull = jax.random.uniform(jax.random.key(1), (count, 2), dtype=float) * jnp.array([0.1, 0.02])

@@ -44,7 +44,8 @@ class Falsify:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder to write, never overwritten silently; runs/falsify-SHIELD by default."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Preset (paper, paper-test) or a TOML or JSON file; the policy's own scenario, or paper, by default."""
+    """Preset (paper, paper-test, paper-0.10, paper-0.15) or a TOML or JSON file; the policy's own scenario,
+    or paper, by default."""
     set: Overrides = ()
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=0."""
     goal: str = unless_given("both")

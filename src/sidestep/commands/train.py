@@ -36,7 +36,8 @@ class Train:
     out: Path
     """Run folder to write; never overwritten silently."""
     scenario: ScenarioName = unless_given("paper")
-    """Preset (paper, paper-test, quadrotor, quadrotor-test) or a TOML or JSON file."""
+    """Preset (paper, paper-test, paper-0.10, paper-0.15, quadrotor, quadrotor-test) or a TOML or JSON
+    file."""
     shield: ShieldName = unless_given("joint")
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = unless_given("nash")

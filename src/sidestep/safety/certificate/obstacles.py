@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import jax
@@ -141,7 +142,7 @@ def fastest_drift(game: ClearanceGame, drift: float, tell: Callable[[str], None]
     while high - low > _DRIFT_STEP:
         middle = (low + high) / 2.0
         tell(f"the fastest drift: between {low:.3f} and {high:.3f} m/s")
-        tried = replace(game, obstacle_speed=middle + SPARE / game.control_period)
+        tried = replace(game, obstacle_speed=middle)
         if _lasts(tried):
             low = middle
         else:
@@ -149,20 +150,23 @@ def fastest_drift(game: ClearanceGame, drift: float, tell: Callable[[str], None]
     return low
 
 
-class _Lost(Exception):
-    """Clearance grows on and on."""
+class _Decided(Exception):
+    """It is known whether clearance grows on and on."""
 
 
 def _lasts(game: ClearanceGame) -> bool:
-    def watch(solution: Solution) -> None:
-        if float(np.max(solution.clearance)) >= 0.95 * _MOST or solution.sweeps >= _SWEEPS:
-            raise _Lost
+    """Whether the coarse solution, the first stage, ends."""
+    ends = False
 
-    try:
-        solve(game, _COARSE, most=_MOST, tolerance=5e-4, progress=watch)
-    except _Lost:
-        return False
-    return True
+    def watch(solution: Solution) -> None:
+        nonlocal ends
+        ends = solution.stage > 0
+        if ends or float(np.max(solution.clearance)) >= 0.95 * _MOST or solution.sweeps >= _SWEEPS:
+            raise _Decided
+
+    with suppress(_Decided):
+        solve(game, _COARSE, most=_MOST, progress=watch)
+    return ends
 
 
 def _direction(table: ClearanceTable, height: float, bearing: float) -> Direction:

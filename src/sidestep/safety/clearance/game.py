@@ -14,8 +14,8 @@ from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.world import Scenario
 
 SPARE = 0.0015
-"""How much farther (m) than by its drift an obstacle may come in a period in the tables that shields and
-certificates read: it absorbs what interpolation loses."""
+"""How much more (m) an obstacle must be away after each period in the tables that shields and certificates
+read: it absorbs what interpolation loses."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,9 @@ class ClearanceGame:
 
     The evader (`evader_speed` v_e, holonomic) decides once per `control_period` T; the pursuer (rim speed V,
     `half_axle` b) must stay at least `capture_distance` l away, the obstacle, which drifts at up to
-    `obstacle_speed` v_c in any direction, at least `collision_distance` d. `angle` S' > S is the design angle
-    of the set that the evader keeps from the pursuer; whether it `can_stop`, or always drives at full speed.
+    `obstacle_speed` v_c in any direction, at least `collision_distance` d, and by `spare` more after each
+    period. `angle` S' > S is the design angle of the set that the evader keeps from the pursuer; whether it
+    `can_stop`, or always drives at full speed.
     """
 
     evader_speed: float = field(metadata=within(above=0.0, most=1e3, unit="m/s"))
@@ -35,6 +36,7 @@ class ClearanceGame:
     collision_distance: float = field(metadata=within(above=0.0, most=1e3, unit="m"))
     obstacle_speed: float = field(metadata=within(least=0.0, most=1e3, unit="m/s"))
     control_period: float = field(metadata=within(above=0.0, most=100.0, unit="s"))
+    spare: float = field(metadata=within(least=0.0, most=1.0, unit="m"))
     angle: float = field(metadata=within(above=0.0, below=math.pi / 2.0, unit="rad"))
     can_stop: bool = True
 
@@ -44,7 +46,7 @@ class ClearanceGame:
 
         **Arguments:** `angle` S' (rad), by default a quarter of the way from S to that with the most slack
         against the pursuer alone: a wider one shortens what is lost per period and lengthens the tip;
-        `spare` (m), how much farther than by its drift an obstacle may come in a period.
+        `spare` (m), how much more an obstacle must be away after a period than the table says.
 
         **Raises** `ValueError` where no angle lets the evader keep the capture distance at this period.
         """
@@ -58,8 +60,9 @@ class ClearanceGame:
             half_axle=float(scenario.pursuer_half_axle),
             capture_distance=float(scenario.capture_distance),
             collision_distance=float(scenario.collision_distance),
-            obstacle_speed=drift + spare / float(scenario.control_period),
+            obstacle_speed=drift,
             control_period=float(scenario.control_period),
+            spare=spare,
             angle=angle,
             can_stop=scenario.action == "velocity",
         )

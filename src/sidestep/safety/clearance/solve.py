@@ -35,16 +35,16 @@ class Resolution:
     `turns` and `drives` of the pursuer's motions, see `ClearanceGame.motions`.
     """
 
-    height: float = bounded(0.0005, above=0.0, most=1.0, unit="m")
-    growth: float = bounded(1.1, above=1.0, most=2.0)
+    height: float = bounded(0.001, above=0.0, most=1.0, unit="m")
+    growth: float = bounded(1.15, above=1.0, most=2.0)
     farthest: float = bounded(0.25, above=0.0, most=1e3, unit="m")
-    share: float = bounded(0.003, above=0.0, most=0.5)
-    share_growth: float = bounded(1.22, above=1.0, most=2.0)
+    share: float = bounded(0.004, above=0.0, most=0.5)
+    share_growth: float = bounded(1.25, above=1.0, most=2.0)
     bearings: int = bounded(20, least=1, most=1000)
-    angles: int = bounded(288, least=32, most=4096)
-    ridge: float = bounded(0.012, above=0.0, most=1.0, unit="rad")
-    headings: int = bounded(64, least=8, most=4096)
-    turns: int = bounded(8, least=1, most=1000)
+    angles: int = bounded(144, least=32, most=4096)
+    ridge: float = bounded(0.014, above=0.0, most=1.0, unit="rad")
+    headings: int = bounded(48, least=8, most=4096)
+    turns: int = bounded(6, least=1, most=1000)
     drives: int = bounded(2, least=2, most=100)
 
     def grid(self, game: ClearanceGame) -> Grid:
@@ -230,6 +230,7 @@ def _settle(
             angles,
             ridge,
             game.obstacle_speed * game.control_period,
+            game.spare,
         )
         if change <= tolerance or (periods is not None and sweeps >= periods):
             break

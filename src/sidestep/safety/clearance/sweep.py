@@ -6,8 +6,9 @@ as the table says whatever the pursuer and the obstacle do. The pursuer's motion
     max over w of R(z_w, phi_w),   phi the direction of p,
 
 and the obstacle, which drifts by up to v_c T in any direction, for so much more that p is outside that shape
-grown by v_c T: R'(z, phi). Before that, among the velocities u that keep the pursuit barrier, one must lead
-to where R' is kept: the obstacle must be at least rho away, the root along the ray phi of
+grown by v_c T, and then by what is to spare: R'(z, phi). Before that, among the velocities u that keep the
+pursuit barrier, one must lead to where R' is kept: the obstacle must be at least rho away, the root along the
+ray phi of
 
     |rho e_phi + u T| = R'(z + u T, direction of rho e_phi + u T).
 
@@ -68,40 +69,52 @@ def _rotated(row, angles, sign, start, least):
         least[k] = max(least[k], value)
 
 
-_PARTS = 8
+_PARTS = 6
 """Directions to each side in which a row is asked to grow it."""
 
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _grown(row, angles, drift, grown):
-    """The row of the shape |p| < row, grown by `drift` (m) in every direction."""
+def _grown(row, angles, drift, spare, grown):
+    """The row of the shape |p| < row, grown by `drift` (m) in every direction and by `spare` outwards."""
     count = len(angles)
     for k in range(count):
         best = row[k] + drift
-        widest = drift / row[k]
-        for part in range(-_PARTS, _PARTS + 1):
-            turn = widest * part / _PARTS
-            node, past, width = _cell(angles, angles[k] + turn)
-            after = node + 1 if node + 1 < count else 0
-            radius = row[node] + np.float32(past / width) * (row[after] - row[node])
-            aside = radius * math.sin(turn)
-            if abs(aside) < drift:
-                reach = radius * math.cos(turn) + math.sqrt(drift * drift - aside * aside)
-                best = max(best, reach)
-        grown[k] = best
+        # What grows into direction k lies at most so far aside, rad; to first order in it.
+        step = drift / (row[k] * _PARTS)
+        for way in (-1, 1):
+            node, past = k, 0.0
+            for _ in range(_PARTS):
+                past += way * step
+                width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+                if past >= width:
+                    past -= width
+                    node = node + 1 if node + 1 < count else 0
+                elif past < 0.0:
+                    node = node - 1 if node > 0 else count - 1
+                    past += (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+                width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+                radius = row[node] + past / width * (row[node + 1 if node + 1 < count else 0] - row[node])
+                turn = angles[node] + past - angles[k]
+                turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+                aside = radius * turn
+                if abs(aside) < drift:
+                    best = max(
+                        best, radius * (1.0 - 0.5 * turn * turn) + math.sqrt(drift * drift - aside * aside)
+                    )
+        grown[k] = best + spare
 
 
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def pursuer_moves(table, nodes, place, strides, share, turned, angles, ridge, drift):
+def pursuer_moves(table, nodes, place, strides, share, turned, angles, ridge, drift, spare):
     """R' in rows for `nodes`, (n, angles).
 
     **Arguments:** `table` (nodes, angles) R, m; for every one of `nodes` and motion `place` (n, motions) the
     first node of the cell it leads to, `share` (n, motions, 2) its weights upwards and along, and `turned`
     (n, motions, 2) the sign of phi there and its offset, less the ridge's angle; `strides`, upwards, in the
     open region and the other, and the first node of that; `angles` of a row, rad; `ridge` of every node, rad;
-    `drift` v_c T, m.
+    `drift` v_c T and what is to `spare`, m.
     """
     count = len(angles)
     result = np.zeros((len(nodes), count), np.float32)
@@ -114,7 +127,7 @@ def pursuer_moves(table, nodes, place, strides, share, turned, angles, ridge, dr
             _mixed(table, place[i, motion], strides, up, along, row)
             sign = turned[i, motion, 0]
             _rotated(row, angles, sign, sign * first + turned[i, motion, 1], needed)
-        _grown(needed, angles, drift, result[i])
+        _grown(needed, angles, drift, spare, result[i])
     return result
 
 

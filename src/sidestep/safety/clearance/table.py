@@ -121,8 +121,8 @@ class ClearanceTable(eqx.Module):
         by `drift` (m) in any of 16 directions.
         """
         place = z + move
-        angles = jnp.arange(16) * (jnp.pi / 8)
-        drifts = drift * jnp.stack([jnp.cos(angles), jnp.sin(angles)], -1)
+        angles = np.arange(16) * (np.pi / 8.0)
+        drifts = drift * jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), place.dtype)
 
         def after(pose: Float[Array, "3"], drifted: Float[Array, "2"]) -> Scalar:
             turn = pose.at[:2].set(0.0)
@@ -143,8 +143,8 @@ class ClearanceTable(eqx.Module):
         look into the table. `drift` (m) of the obstacle in the period, at most that of the game."""
         ahead, moved = self.grid.nearer(jnp, z[0] + move[0]), offset + move
         _, clearance = self._look(self.after, ahead, z[1] + move[1], moved)
-        spare = self.game.obstacle_speed * self.game.control_period - drift
-        return jnp.hypot(moved[0], moved[1]) - clearance + spare
+        slower = self.game.obstacle_speed * self.game.control_period - drift
+        return jnp.hypot(moved[0], moved[1]) - clearance + self.game.spare + slower
 
     @property
     def farthest(self) -> float:
