@@ -122,15 +122,15 @@ class ClearanceTable(eqx.Module):
         """
         place = z + move
         angles = np.arange(16) * (np.pi / 8.0)
-        drifts = drift * jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), place.dtype)
+        around = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), place.dtype)
 
-        def after(pose: Float[Array, "3"], drifted: Float[Array, "2"]) -> Scalar:
+        def after(pose: Float[Array, "3"], way: Float[Array, "2"]) -> Scalar:
             turn = pose.at[:2].set(0.0)
-            moved = (offset + move - drifted).astype(turn.dtype)
+            moved = (offset + move - drift * way).astype(turn.dtype)
             return self.margin(to_pursuer_frame(place, pose), to_pursuer_frame(moved, turn))
 
         every = jax.vmap(jax.vmap(after, in_axes=(None, 0)), in_axes=(0, None))
-        return jnp.min(every(jnp.asarray(poses), drifts))
+        return jnp.min(every(jnp.asarray(poses), around))
 
     def spare_after(
         self,

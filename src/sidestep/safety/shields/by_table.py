@@ -20,7 +20,7 @@ from sidestep.safety.filter.status import Status
 from sidestep.safety.shields.answer import correction, known_parts
 from sidestep.safety.shields.game import GameShield
 from sidestep.safety.shields.going_round import next_turn, still_turned, turned
-from sidestep.safety.shields.joint import JointMemory, JointShield
+from sidestep.safety.shields.joint import JointShield
 from sidestep.safety.shields.masked_cond import masked_cond
 from sidestep.safety.shields.shield import Shield, ShieldResult
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -36,10 +36,11 @@ _BACK = 8
 
 class TableMemory(eqx.Module):
     """What the shield keeps from call to call: the `turn ()` that leads it round an obstacle, see
-    `going_round`, and the memory of the look-ahead where it is `crowded`, None for a shield without one."""
+    `going_round`, and the `JointMemory` of the look-ahead where it is `crowded`, None for a shield without
+    one."""
 
     turn: Scalar
-    crowded: JointMemory | None
+    crowded: Any
 
 
 class _Margins(eqx.Module):
