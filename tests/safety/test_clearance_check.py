@@ -136,7 +136,7 @@ def test_a_damaged_file_is_refused(tmp_path):
         ("low", {**plain, "clearance": clearance}, about, "less than the collision distance"),
         ("short", {**plain, "clearance": clearance[:-1]}, about, "clearances, not"),
         ("headless", plain, {**about, "game": {}}, "no clearance table"),
-        ("old", plain, {**about, "format": 1}, "format 1, not 2"),
+        ("old", plain, {**about, "format": 1}, "format 1, not 3"),
     ):
         write_arrays(tmp_path / name, tree, **header)
         with pytest.raises(ValueError, match=said):

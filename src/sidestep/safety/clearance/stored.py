@@ -17,7 +17,7 @@ from sidestep.store.checkpoints import read_named
 
 OPEN, COMMITTED, ARC = range(3)
 """Regions: b >= 0; b < 0; beside the tip, where the bearing takes the place of b."""
-_STEP, _FORMAT = 3e-5, 2
+_STEP, _FORMAT = 2e-5, 3
 
 
 def _index(spacing: Any, value: Any) -> Any:
