@@ -161,7 +161,10 @@ def test_numbers_that_are_not_finite_are_reported_and_never_driven(part):
         assert float(SHIELD._margin_after(alone, result.action)) >= 0.0
 
 
-@pytest.mark.parametrize("pursuers, obstacles", [(1, 0), (1, 2), (2, 3)])
+@pytest.mark.parametrize(
+    "pursuers, obstacles",
+    [(1, 0), pytest.param(1, 2, marks=pytest.mark.slow), pytest.param(2, 3, marks=pytest.mark.slow)],
+)
 def test_any_number_of_robots(pursuers, obstacles):
     scenario = load_scenario("paper-0.15", pursuer_count=pursuers, obstacle_count=obstacles)
     shield = make_shield("joint", scenario)
