@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import sidestep
-from sidestep._arrays import norm
 from sidestep.safety import make_shield
 from sidestep.safety.clearance import shipped_table
 from sidestep.safety.shields import TableShield
@@ -190,8 +189,7 @@ def main() -> None:
         scenario = eqx.tree_at(
             lambda s: s.obstacle_velocity, scenario, asked.faster * scenario.obstacle_velocity
         )
-        closing = float(scenario.evader_speed + norm(scenario.obstacle_velocity))
-        gap = asked.closer * 2.0 * (table.farthest + closing * float(scenario.control_period))
+        gap = asked.closer * table.smallest_gap
         target = Target(scenario, sidestep.goal_seeking, shield)
         for name in asked.attacks:
             wanted = max(1, asked.chases // LIMIT.get(name, 1))

@@ -129,7 +129,7 @@ def run(command: Certify, console: Console) -> int:
         png, pdf = certificate_figure(certificate, command.figure)
         console.print(f"Figure: {png} and {pdf}", soft_wrap=True)
         if certificate.obstacles is not None:
-            from sidestep.safety.certificate.obstacles import table_for
+            from sidestep.safety.clearance import table_for
             from sidestep.views import obstacle_figure
 
             png, pdf = obstacle_figure(table_for(scenario), _beside(command.figure))

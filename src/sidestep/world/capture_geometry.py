@@ -15,6 +15,14 @@ def to_pursuer_frame(
     return stack(cosine * x + sine * y, -sine * x + cosine * y)
 
 
+def to_pursuer_axes(
+    vector: Float[AnyArray, "2 *lanes"], heading: Float[AnyArray, "*lanes"]
+) -> Float[Array, "2 *lanes"]:
+    """R(-theta) v: a vector in the axes of a pursuer with that heading (rad)."""
+    origin = jnp.zeros_like(heading)
+    return to_pursuer_frame(vector, stack(origin, origin, heading))
+
+
 def usable_angle(evader_speed: Float[AnyArray, ""], pursuer_speed: Float[AnyArray, ""]) -> Scalar:
     """S = arccos(min(v_e/V, 1)), rad: contact at larger angles to the pursuer's axis cannot be forced."""
     return jnp.arccos(jnp.clip(evader_speed / pursuer_speed, 0.0, 1.0))

@@ -52,9 +52,8 @@ class Scenario(eqx.Module):
 
     - `evader_speed` v_e, `pursuer_speed` V (wheel rim), m/s
     - `pursuer_half_axle` b, `capture_distance` l, `collision_distance` d_oc, `reach_distance` d_t, m
-    - `obstacle_velocity (2,)`, m/s; with `obstacle_directions="random"` or `obstacle_motion="adversarial"`
-    only
-      its magnitude is used
+    - `obstacle_velocity (2,)`, m/s; only its magnitude is used with `obstacle_directions="random"` or
+      `obstacle_motion="adversarial"`
     - `control_period` T, s
 
     **Shield** `pursuer_gain`, `obstacle_gain`, 1/s.

@@ -11,16 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.safety.clearance import (
-    SPARE,
-    ClearanceGame,
-    ClearanceTable,
-    Resolution,
-    Solution,
-    clearance_table,
-    shipped_table,
-    solve,
-)
+from sidestep.safety.clearance import ClearanceGame, ClearanceTable, Resolution, Solution, solve, table_for
 from sidestep.safety.clearance.solve import STAGES
 from sidestep.world.scenario import Scenario
 
@@ -77,24 +68,6 @@ class ObstacleClearance:
     obstacle_margin: float | None = None
 
 
-def table_for(scenario: Scenario, tell: Callable[[str], None] = lambda _: None) -> ClearanceTable:
-    """The table that comes with sidestep for a scenario, or the one kept from an earlier time, or solved for.
-
-    **Raises** `ValueError` where there is none, saying why.
-    """
-    shipped = shipped_table(scenario)
-    if shipped is not None:
-        return shipped
-
-    def progress(solution: Solution) -> None:
-        tell(
-            f"clearance table, {STAGES[solution.stage]}, sweep {solution.sweeps}, largest "
-            f"{float(np.max(solution.clearance)):.3f} m, last change {1e3 * solution.change:.2g} mm"
-        )
-
-    return clearance_table(ClearanceGame.of(scenario, spare=SPARE), progress=progress)
-
-
 def obstacle_clearance(
     scenario: Scenario,
     *,
@@ -111,13 +84,20 @@ def obstacle_clearance(
 
     **Raises** `ValueError` where there is no table, saying why.
     """
-    table = table_for(scenario, tell)
-    game, period = table.game, float(scenario.control_period)
+
+    def progress(solution: Solution) -> None:
+        tell(
+            f"clearance table, {STAGES[solution.stage]}, sweep {solution.sweeps}, largest "
+            f"{float(np.max(solution.clearance)):.3f} m, last change {1e3 * solution.change:.2g} mm"
+        )
+
+    table = table_for(scenario, progress=progress)
+    game = table.game
     drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
     found = ObstacleClearance(
         game=game,
         beyond=table.farthest,
-        smallest_gap=2.0 * (table.farthest + (game.evader_speed + drift) * period),
+        smallest_gap=table.smallest_gap,
         drift=drift,
         fastest_drift=fastest_drift(game, drift, tell) if search_drift else None,
         directions=tuple(_direction(table, h, math.radians(b)) for b in BEARINGS for h in HEIGHTS),

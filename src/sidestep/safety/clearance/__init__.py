@@ -2,7 +2,7 @@
 
 from sidestep.safety.clearance.game import SPARE, ClearanceGame
 from sidestep.safety.clearance.solve import Resolution, Solution, solve
-from sidestep.safety.clearance.table import STEP, ClearanceTable, clearance_table, shipped_table
+from sidestep.safety.clearance.table import STEP, ClearanceTable, clearance_table, shipped_table, table_for
 
 __all__ = [
     "SPARE",
@@ -14,4 +14,5 @@ __all__ = [
     "clearance_table",
     "shipped_table",
     "solve",
+    "table_for",
 ]

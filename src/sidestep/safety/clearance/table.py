@@ -22,11 +22,11 @@ from jaxtyping import Array, Float, UInt16
 from sidestep import _interrupts
 from sidestep._arrays import AnyArray, Scalar
 from sidestep._compiled import cache_folder
-from sidestep.safety.clearance.game import ClearanceGame
+from sidestep.safety.clearance.game import SPARE, ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Spacing
 from sidestep.safety.clearance.solve import STAGES, Resolution, Solution, solve
 from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
-from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
 from sidestep.world.scenario import Scenario
 
 _FORMAT = 3
@@ -125,9 +125,8 @@ class ClearanceTable(eqx.Module):
         around = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), place.dtype)
 
         def after(pose: Float[Array, "3"], way: Float[Array, "2"]) -> Scalar:
-            turn = pose.at[:2].set(0.0)
-            moved = (offset + move - drift * way).astype(turn.dtype)
-            return self.margin(to_pursuer_frame(place, pose), to_pursuer_frame(moved, turn))
+            moved = (offset + move - drift * way).astype(pose.dtype)
+            return self.margin(to_pursuer_frame(place, pose), to_pursuer_axes(moved, pose[2]))
 
         every = jax.vmap(jax.vmap(after, in_axes=(None, 0)), in_axes=(0, None))
         return jnp.min(every(jnp.asarray(poses), around))
@@ -150,6 +149,12 @@ class ClearanceTable(eqx.Module):
     def farthest(self) -> float:
         """The largest R, m: obstacles beyond do not matter from any z with h' >= 0."""
         return STEP * float(jnp.max(self.clearance))
+
+    @property
+    def smallest_gap(self) -> float:
+        """How far apart, m, the centres of obstacles must stay for only one at a time to matter."""
+        closing = self.game.evader_speed + self.game.obstacle_speed
+        return 2.0 * (self.farthest + closing * self.game.control_period)
 
     def save(self, path: str | Path) -> None:
         """Write the table to a file. **Raises** `OutputError` where that cannot be written."""
@@ -215,6 +220,17 @@ def clearance_table(
     table.save(kept)
     on_the_way.unlink(missing_ok=True)
     return table
+
+
+def table_for(scenario: Scenario, *, progress: Callable[[Solution], None] | None = None) -> ClearanceTable:
+    """The table that comes with sidestep for a scenario, or else the one of `clearance_table`.
+
+    **Raises** `ValueError` where there is none, saying why.
+    """
+    shipped = shipped_table(scenario)
+    if shipped is not None:
+        return shipped
+    return clearance_table(ClearanceGame.of(scenario, spare=SPARE), progress=progress)
 
 
 def shipped_table(scenario: Scenario) -> ClearanceTable | None:

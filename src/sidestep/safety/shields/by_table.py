@@ -23,7 +23,7 @@ from sidestep.safety.shields.going_round import next_turn, still_turned, turned
 from sidestep.safety.shields.joint import JointShield
 from sidestep.safety.shields.masked_cond import masked_cond
 from sidestep.safety.shields.shield import Shield, ShieldResult
-from sidestep.world.capture_geometry import to_pursuer_frame
+from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
@@ -72,7 +72,9 @@ class TableShield(Shield):
 
     **What holds.** For one pursuer and one obstacle what the table promises (see `ClearanceTable`): it is
     computed, not proved. Several are kept by the worst of all pairs, which promises as much while no two
-    matter at once. An evader that is stuck behind an obstacle goes round it, see `going_round`.
+    matter at once. Where a second one is near, `crowded` decides if there is one: a look-ahead, which
+    `make_shield` adds for several obstacles or pursuers. An evader that is stuck behind an obstacle goes
+    round it, see `going_round`.
 
     The barriers reported are h' and |p| - R, m. The action carries the derivative of the nominal one where
     that is accepted, else none; `rows_only` is the shield to learn through.
@@ -250,7 +252,7 @@ class TableShield(Shield):
             z = to_pursuer_frame(world.evader, pose)
             heights.append(self.table.grid.height(jnp, z[0], z[1]) - self.spare_pursuer)
             gaps = [
-                norm(p) - self.table(z, _turned_by(p, pose[2]))[1] - self.spare_obstacle
+                norm(p) - self.table(z, to_pursuer_axes(p, pose[2]))[1] - self.spare_obstacle
                 for p in world.evader - world.obstacles[:, :2]
             ]
             towards_obstacles = _at_most(towards_obstacles, gaps)
@@ -264,12 +266,12 @@ class TableShield(Shield):
         heights = []
         motions = jnp.asarray(self.table.game.motions(_TURNS, 2), move.dtype)
         for pose in world.pursuers:
-            z, moved = to_pursuer_frame(world.evader, pose), _turned_by(move, pose[2])
+            z, moved = to_pursuer_frame(world.evader, pose), to_pursuer_axes(move, pose[2])
             there = jnp.broadcast_to((z + moved)[:, None], (2, len(motions)))
             seen = to_pursuer_frame(there, motions.T)
             heights.append(jnp.min(self.table.grid.height(jnp, seen[0], seen[1])) - self.spare_pursuer)
             gaps = [
-                self.table.spare_after(z, _turned_by(p, pose[2]), moved, drift) - self.spare_obstacle
+                self.table.spare_after(z, to_pursuer_axes(p, pose[2]), moved, drift) - self.spare_obstacle
                 for p in world.evader - world.obstacles[:, :2]
             ]
             towards_obstacles = _at_most(towards_obstacles, gaps)
@@ -286,11 +288,6 @@ class TableShield(Shield):
     @property
     def _drift(self) -> Scalar:
         return norm(self.scenario.obstacle_velocity)
-
-
-def _turned_by(vector: Float[Array, "2"], heading: Scalar) -> Float[Array, "2"]:
-    """A vector in the frame of a pursuer with that heading."""
-    return to_pursuer_frame(vector, jnp.stack([jnp.zeros_like(heading), jnp.zeros_like(heading), heading]))
 
 
 def _at_most(values: Float[Array, "k"], others: list[Scalar]) -> Float[Array, "k"]:

@@ -11,7 +11,7 @@ from sidestep.pursuit.game import CaptureGame
 from sidestep.safety.barriers.barrier import Barrier, ObstacleBarrier, RangeBarrier
 from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.pursuit_barrier import PursuitBarrier
-from sidestep.safety.clearance import SPARE, ClearanceGame, clearance_table, shipped_table
+from sidestep.safety.clearance import SPARE, ClearanceGame, shipped_table, table_for
 from sidestep.safety.shields.adapted import AdaptedShield, covered, of_control_point
 from sidestep.safety.shields.barrier_shield import shield_of
 from sidestep.safety.shields.by_table import TableShield
@@ -82,7 +82,7 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
             several = scenario.obstacle_count > 1 or scenario.pursuer_count > 1
             return TableShield(scenario, table, crowded=JointShield(scenario) if several else None)
     if name == "joint:table":
-        return TableShield(scenario, shipped_table(scenario) or clearance_table(_game_of(scenario)))
+        return TableShield(scenario, table_for(scenario))
     kind: Any = (SHIELDS | JOINT_FORMS)[name]
     return kind(scenario, budget=budget) if name in PURSUIT_SHIELDS else kind(scenario)
 
@@ -129,13 +129,12 @@ def name_of(shield: Shield, scenario: Scenario) -> str | None:
         # Compared without solving for a table.
         if shipped_table(scenario) is None:
             alike = eqx.tree_equal(shield, TableShield(scenario, shield.table))
-            return "joint:table" if bool(alike) and shield.table.game == _game_of(scenario) else None
+            return (
+                "joint:table"
+                if bool(alike) and shield.table.game == ClearanceGame.of(scenario, spare=SPARE)
+                else None
+            )
         names = ["joint", "joint:table"]
     elif isinstance(shield, JointShield):
         names = ["joint", "joint:look-ahead"]
     return next((n for n in names if bool(eqx.tree_equal(shield, make_shield(n, scenario)))), None)
-
-
-def _game_of(scenario: Scenario) -> ClearanceGame:
-    """What `joint:table` solves for: what is to spare absorbs the table's interpolation."""
-    return ClearanceGame.of(scenario, spare=SPARE)

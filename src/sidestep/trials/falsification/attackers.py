@@ -14,7 +14,7 @@ from sidestep.pursuit import PURSUERS, Pursuer, make_pursuer
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.safety.clearance import ClearanceTable
 from sidestep.world import Scenario, World
-from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
+from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_axes, to_pursuer_frame
 from sidestep.world.robots import drive, wheels_from_body
 
 _STAND_OFF = 0.1
@@ -214,9 +214,8 @@ class JointSaddle(Pursuer):
         if self.table is None:
             return jnp.minimum(h, gap - scenario.collision_distance), h, gap
         margin = self.table.grid.height(jnp, z[0], z[1])
-        turn = pose.at[:2].set(0.0)
         for offset in offsets:
-            margin = jnp.minimum(margin, self.table.margin(z, to_pursuer_frame(offset, turn)))
+            margin = jnp.minimum(margin, self.table.margin(z, to_pursuer_axes(offset, pose[2])))
         return margin, h, gap
 
     def _answered(self, scenario: Scenario, evader: Array, pose: Array, obstacles: Array) -> Scalar:

@@ -114,7 +114,7 @@ def _judge_table(scenario: Scenario, table: ClearanceTable, trajectory: Trajecto
             "start", f"it starts {-1e3 * margin:.3g} mm inside what its clearance table keeps free"
         )
     if scenario.obstacle_count > 1:
-        gap = 2.0 * (table.farthest + table.game.evader_speed * table.game.control_period)
+        gap = table.smallest_gap
         places = np.asarray(trajectory.worlds.obstacles[:, :, :2])
         apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
         apart = np.where(np.eye(apart.shape[-1], dtype=bool), np.inf, apart)
