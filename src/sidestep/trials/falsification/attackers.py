@@ -220,14 +220,14 @@ class JointSaddle(Pursuer):
 
     def _answered(self, scenario: Scenario, evader: Array, pose: Array, obstacles: Array) -> Scalar:
         duration = _AFTERWARDS * scenario.control_period
-        heading = jnp.arange(16) * (2.0 * jnp.pi / 16)
+        heading = (2.0 * jnp.pi / 16) * jnp.arange(16).astype(evader.dtype)
         reached = scenario.evader_speed * duration * jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1)
         corners = jnp.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], evader.dtype)
         axle, speed = scenario.pursuer_half_axle, scenario.pursuer_speed
         poses = jax.vmap(lambda corner: drive(pose, speed * corner, axle, duration))(corners)
 
         def worst(move: Array) -> Scalar:
-            there = evader + move.astype(evader.dtype)
+            there = evader + move
             return jnp.min(jax.vmap(lambda pose: self._margin(scenario, there, pose, obstacles)[0])(poses))
 
         return jnp.max(jax.vmap(worst)(reached))
