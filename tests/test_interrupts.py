@@ -143,6 +143,31 @@ def test_what_has_to_happen_first_happens_the_latest_first_and_a_failure_does_no
     assert (code, out) == (130, "last\nfirst\n")
 
 
+@pytest.mark.parametrize(
+    "work, moment",
+    [
+        ("from sidestep.store.files import write_bytes; write_bytes(PLACE, b'all of it')", "fsync"),
+        ("from sidestep.store.files import write_bytes; write_bytes(PLACE, b'all of it')", "replace"),
+        ("from sidestep.store.outputs import try_outputs; try_outputs(files=[PLACE])", "fsync"),
+    ],
+)
+def test_an_interrupt_just_before_a_file_is_in_place_leaves_nothing_beside_it(work, moment, tmp_path):
+    code, _, err = ended(
+        program(f"""
+            os.write(1, b"ready\\n")
+            PLACE, real = {str(tmp_path / "new" / "page.html")!r}, os.{moment}
+            def interrupted(*arguments):
+                os.kill(os.getpid(), signal.SIGINT)
+                return real(*arguments)
+            os.{moment} = interrupted
+            {work}
+            """),
+        interrupts=0,
+    )
+    assert (code, err) == (130, "")
+    assert [path for path in tmp_path.rglob("*") if path.is_file() or path.name != "new"] == []
+
+
 def test_an_ignored_interrupt_stays_ignored():
     """A shell without job control starts background jobs that way."""
     body = (

@@ -166,11 +166,12 @@ def whole_file(path: str | Path, needed: int | None = None) -> Iterator[Path]:
         place.parent.mkdir(parents=True, exist_ok=True)
         beside = place.with_name(f".{place.name}.{os.getpid()}.tmp")
         try:
+            # Until it is renamed: to sync it takes long enough for a Ctrl-C to come.
             with _interrupts.before_leaving(lambda: beside.unlink(missing_ok=True)):
                 yield beside
-            with open(beside, "rb+") as file:
-                os.fsync(file.fileno())
-            os.replace(beside, place)
+                with open(beside, "rb+") as file:
+                    os.fsync(file.fileno())
+                os.replace(beside, place)
         except BaseException as error:
             with suppress(OSError):
                 beside.unlink(missing_ok=True)

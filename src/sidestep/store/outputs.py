@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from sidestep import _interrupts
 from sidestep.store.files import PROBE, OutputError, descriptor_of, is_stream, writing
 
 _PROBE = bytes(4096)
@@ -85,12 +86,17 @@ def _try_folder(named: Path, place: Path) -> None:
         raise OutputError(named, f"{named} could not be written: {there} is not a folder")
     missing = place.parent.relative_to(there)
     probe = Path(tempfile.mkdtemp(prefix=f"{PROBE}{os.getpid()}-", dir=there))
-    try:
-        (probe / missing).mkdir(parents=True, exist_ok=True)
-        # As long as the temporary name of `whole_file`.
-        with open(probe / missing / f".{place.name}.{os.getpid()}.tmp", "wb") as file:
-            file.write(_PROBE)
-            file.flush()
-            os.fsync(file.fileno())
-    finally:
+
+    def remove() -> None:
         shutil.rmtree(probe, ignore_errors=True)
+
+    try:
+        with _interrupts.before_leaving(remove):
+            (probe / missing).mkdir(parents=True, exist_ok=True)
+            # As long as the temporary name of `whole_file`.
+            with open(probe / missing / f".{place.name}.{os.getpid()}.tmp", "wb") as file:
+                file.write(_PROBE)
+                file.flush()
+                os.fsync(file.fileno())
+    finally:
+        remove()
