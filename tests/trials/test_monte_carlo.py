@@ -49,6 +49,31 @@ def test_figures_agree_with_the_outcomes(evaluation, scenario):
     assert np.allclose(evaluation.times, evaluation.steps * 0.05)
 
 
+def test_time_to_the_target_is_that_of_the_limit_where_it_was_not_reached(evaluation, scenario):
+    reached, report = evaluation.numbers_of("reached"), evaluation.to_dict()
+    times = evaluation.times_to_target
+    assert np.array_equal(times[reached], evaluation.times[reached])
+    others = np.delete(times, reached)
+    assert len(others) > 0
+    assert np.all(others == evaluation.time_limit)
+    assert evaluation.time_limit == pytest.approx(scenario.episode_steps * 0.05)
+    assert report["time_mean"] == pytest.approx(np.mean(times))
+    assert report["reached_by"]["15"] == pytest.approx(len(reached) / 150)
+
+
+def test_nobody_is_faster_than_straight_at_full_speed(evaluation, scenario):
+    reached = evaluation.numbers_of("reached")
+    # The target is reached within a period, which counts in full.
+    assert np.all(evaluation.straight_times[reached] <= evaluation.times[reached] + 1e-4)
+    alone = evaluate(
+        load_scenario("paper", **{**SETTING, "obstacle_count": 0}), "goal-seeking", "none", "still", 50, 7
+    )
+    undisturbed = alone.numbers_of("reached")
+    assert len(undisturbed) > 40
+    late = (alone.times - alone.straight_times)[undisturbed]
+    assert np.all((late >= -1e-4) & (late < 0.05 + 1e-4))
+
+
 def test_results_do_not_depend_on_the_batch_size(evaluation, scenario):
     other = evaluate(scenario, "goal-seeking", "none", "turn-then-drive", 150, jax.random.key(7), batch=200)
     assert np.array_equal(other.outcome, evaluation.outcome)

@@ -101,8 +101,8 @@ class EpisodeBatch:
     The width does not depend on the number of episodes, and free slots are refilled: each width compiles
     separately, which takes longer than ten thousand episodes.
 
-    **Attributes:** `results` per episode: `outcome` and the fields of `Tally` by name; `sums`, the result of
-    `trial.read`, 0 without.
+    **Attributes:** `results` per episode: `outcome`, the fields of `Tally` by name, and `distance` (m) from
+    the start to the target; `sums`, the result of `trial.read`, 0 without.
     """
 
     def __init__(self, trial: Trial, begin: int, end: int):
@@ -137,6 +137,8 @@ class EpisodeBatch:
         worlds = _starts(trial.task.scenario, trial.key, jnp.asarray(np.maximum(fresh, 0)))
         slots = self._slots or _empty_slots(trial.task.shield, worlds, trial.width)
         self._slots = _refill(trial.task.shield, slots, jnp.asarray(fresh), worlds)
+        way = np.asarray(worlds.target - worlds.evader)[:, free]
+        self._keep("distance", np.hypot(*way), fresh[free])
         self._numbers[free] = fresh[free]
         self._next += len(free)
 
@@ -151,8 +153,11 @@ class EpisodeBatch:
         ended = np.flatnonzero(~np.asarray(episode.running) & (self._numbers >= 0))
         collected = {field.name: getattr(episode.tally, field.name) for field in fields(Tally)}
         for name, values in {"outcome": episode.outcome, **collected}.items():
-            values = np.asarray(values)
-            whole = self.results.setdefault(name, np.zeros(self._end - self._begin, values.dtype))
-            whole[self._numbers[ended] - self._begin] = values[ended]
+            self._keep(name, np.asarray(values)[ended], self._numbers[ended])
         self._numbers[ended] = RUNNING
         return len(ended)
+
+    def _keep(self, name: str, values: np.ndarray, numbers: np.ndarray) -> None:
+        """Keep results of these episodes."""
+        whole = self.results.setdefault(name, np.zeros(self._end - self._begin, values.dtype))
+        whole[numbers - self._begin] = values

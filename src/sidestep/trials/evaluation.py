@@ -14,6 +14,8 @@ from sidestep.trials.intervention_map import InterventionMap
 from sidestep.trials.statistics import wilson_interval
 
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
+REACHED_BY = (15, 30, 60, 120)
+"""Times (s) by which the share of episodes that have reached the target is reported."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Evaluation:
     - `map` of interventions, if requested
     - `pursuer_invalid`: control periods in which a pursuer's wheel speeds were not finite and it stood still
       (None: recorded by a version that did not count them)
+    - `straight_times`, s: the time from the start to the target straight at full speed, which no policy can
+      beat; `time_limit` of an episode, s (None: recorded by a version without them)
     """
 
     outcome: Int[np.ndarray, "episodes"]
@@ -44,6 +48,8 @@ class Evaluation:
     max_correction: Float[np.ndarray, "episodes"]
     map: InterventionMap | None = None
     pursuer_invalid: Int[np.ndarray, "episodes"] | None = None
+    straight_times: Float[np.ndarray, "episodes"] | None = None
+    time_limit: float | None = None
 
     def numbers_of(self, outcome: str) -> Int[np.ndarray, "some"]:
         """Numbers of the episodes with this outcome; `rollout` with `episode_key` replays them."""
@@ -88,6 +94,13 @@ class Evaluation:
         times = self.times[self.numbers_of("reached")]
         return float(np.median(times)) if len(times) else None
 
+    @property
+    def times_to_target(self) -> Float[np.ndarray, "episodes"]:
+        """Time (s) of each episode to the target; the time limit where it was not reached, for whatever
+        reason, so that policies can be compared start by start. Without a `time_limit`, infinite there."""
+        limit = np.inf if self.time_limit is None else self.time_limit
+        return np.where(self.outcome == OUTCOMES.index("reached"), self.times, limit)
+
     def _share(self, periods: Int[np.ndarray, "episodes"]) -> float:
         return float(periods.sum() / self.steps.sum())
 
@@ -110,7 +123,9 @@ class Evaluation:
         """JSON values: counts, `X_rate` with its 95 % Wilson interval `X_rate_low`, `X_rate_high` for X in
         captured, collided, reached, timed_out and safe, and summaries of the other attributes.
 
-        Clearances without such a robot, and the median time without an episode that reached, are null.
+        `time_mean` is that of `times_to_target`, `straight_time_mean` that of `straight_times`, both in s;
+        `reached_by` gives the share that had reached the target after so many seconds. Clearances without
+        such a robot, and the median time without an episode that reached, are null.
         """
         counts = {name: self._count(name) for name in OUTCOMES} | {"safe": self.safe}
         report: dict[str, Any] = {"episodes": self.episodes, **counts}
@@ -132,6 +147,15 @@ class Evaluation:
 
         report |= {
             "reach_time_median": self.reach_time_median,
+            "time_mean": float(np.mean(self.times_to_target)),
+            "straight_time_mean": None
+            if self.straight_times is None
+            else float(np.mean(self.straight_times)),
+            "time_limit": self.time_limit,
+            "reached_by": {
+                str(time): float(np.mean((self.times <= time) & (self.outcome == OUTCOMES.index("reached"))))
+                for time in REACHED_BY
+            },
             "mean_return": float(np.mean(self.returns)),
             "env_steps": int(self.steps.sum()),
             "min_pursuer_clearance": float(np.min(self.min_pursuer_clearance)),

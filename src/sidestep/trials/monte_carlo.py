@@ -100,12 +100,13 @@ def evaluate(
 def _evaluation(
     scenario: Scenario, results: dict[str, np.ndarray], where: InterventionMap | None
 ) -> Evaluation:
-    steps = results["steps"]
+    steps, period = results["steps"], np.asarray(scenario.control_period, dtype=float)
+    straight = np.maximum(results["distance"] - np.asarray(scenario.reach_distance), 0.0)
     return Evaluation(
         outcome=results["outcome"],
         returns=results["total_reward"],
         steps=steps,
-        times=steps * np.asarray(scenario.control_period, dtype=float),
+        times=steps * period,
         min_pursuer_clearance=results["pursuer_clearance"],
         min_obstacle_clearance=results["obstacle_clearance"],
         interventions=results["interventions"],
@@ -115,4 +116,6 @@ def _evaluation(
         max_correction=results["max_correction"],
         map=where,
         pursuer_invalid=results["pursuer_invalid"],
+        straight_times=straight / np.asarray(scenario.evader_speed),
+        time_limit=float(scenario.episode_steps * period),
     )

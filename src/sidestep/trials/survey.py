@@ -182,6 +182,8 @@ def load_survey(folder: str | Path) -> Survey | None:
         where = {name.removeprefix(_MAP): arrays.pop(name) for name in list(arrays) if name.startswith(_MAP)}
         seed = int(arrays.pop("seed"))
         numbers, hazards = arrays.pop("worst_numbers"), arrays.pop("worst_hazards")
+        if "time_limit" in arrays:
+            arrays["time_limit"] = float(arrays["time_limit"])
         evaluation = Evaluation(**arrays, map=InterventionMap.from_arrays(where) if where else None)
         worst = tuple(
             WorstEpisode(int(number), HAZARDS[hazard], load_trajectory(_worst_path(folder, int(number))))
