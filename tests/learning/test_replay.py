@@ -146,6 +146,31 @@ def test_hindsight_targets_lie_later_in_the_same_episode_and_never_in_overwritte
     assert (seen_later > 100) == (max(lengths) > 1)
 
 
+def test_hindsight_among_many_worlds_stays_in_the_world_and_its_episode():
+    """World i of 4 has episodes of i + 1 decisions; the ring wraps round several times."""
+    worlds, replay = 4, Replay.init(made_up(0), 38, worlds=4)
+    assert replay.capacity == 40
+    episode_of, seen_later = [], 0
+    for decision in range(31):
+        ones = [made_up(decision * worlds + world) for world in range(worlds)]
+        lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1), *ones)
+        ended = [decision // (world + 1) for world in range(worlds)]
+        episode_of += list(enumerate(ended))
+        replay = add(replay, lanes, jnp.asarray(ended), jnp.asarray(True))
+        _, after = draw(replay, jax.random.key(decision))
+        newest = len(episode_of) - 1
+        for count, target in zip(
+            np.asarray(after.time).round().astype(int), np.asarray(after.target), strict=True
+        ):
+            later = int(np.floor(target[0] + 1e-3))
+            assert max(0, newest + 1 - 40) <= count <= later <= newest
+            assert episode_of[later] == episode_of[count], "the target lies in another world or episode"
+            seen_later += later > count
+    assert seen_later > 1000
+    unchanged = add(replay, lanes, jnp.asarray(ended), jnp.asarray(False))
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (replay, unchanged)), strict=True))
+
+
 def test_every_slot_and_every_later_place_can_be_drawn():
     *_, (replay, _) = fill((3, 6))
     counts, places = [], set()

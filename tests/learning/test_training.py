@@ -42,6 +42,48 @@ def test_one_update_per_decision_after_the_warm_up_and_none_within(small, small_
     assert small.differences(warm.learner, state.learner) == []
 
 
+@pytest.fixture(scope="module")
+def many(small):
+    """A training in three worlds."""
+    return small.train(options=small.options(worlds=3, replay_capacity=512))
+
+
+def test_many_worlds_keep_their_episodes_apart(small, many):
+    """Within an episode of a world, each transition begins where the last one ended; between episodes not."""
+    replay = many.state.replay
+    count = int(replay.written)
+    assert count == 3 * int(many.state.decisions) <= replay.capacity
+    before, after = replay.transitions.world, replay.transitions.next_world
+    episode = np.asarray(replay.episode[:count])
+    continued = 0
+    for slot in range(count - 3):
+        same = episode[slot] == episode[slot + 3]
+        assert same == np.array_equal(after.evader[slot], before.evader[slot + 3])
+        assert same == bool(before.time[slot + 3] > 0.0)
+        assert episode[slot] % 3 == slot % 3
+        continued += same
+    assert 0 < continued < count - 3
+
+
+def test_many_worlds_count_every_episode_and_period(small, many):
+    running = many.state.episode.tally.steps.sum()
+    assert int(many.state.env_steps) == sum(line["steps"] for line in many.metrics) + int(running)
+    # The last decision may end an episode in each world.
+    assert 8 <= len(many.metrics) == int(many.state.ended) <= 10
+    assert [line["episode"] for line in many.metrics] == list(range(1, len(many.metrics) + 1))
+    assert int(many.state.learner.updates) == int(many.state.decisions) - 4
+    assert len({line["return"] for line in many.metrics}) == len(many.metrics)
+
+
+@pytest.mark.slow
+def test_many_worlds_stopped_and_resumed_are_the_same_training(small, many, tmp_path):
+    options = small.options(worlds=3, replay_capacity=512)
+    small.train(options=options, episodes=4, out=tmp_path / "run")
+    resumed = small.train(options=options, out=tmp_path / "run", resume=True)
+    assert resumed.metrics == many.metrics
+    assert small.differences(resumed.state, many.state) == []
+
+
 def test_seed_decides_everything(small, small_run):
     again, other = small.train(), small.train(seed=1)
     assert again.metrics == small_run.metrics

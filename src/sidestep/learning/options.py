@@ -18,7 +18,10 @@ class TrainingOptions(eqx.Module):
 
     - `algorithm`: the hyper-parameters of TD3; its discount applies per decision.
     - `decision_steps`: control periods between two decisions; the shield runs at each period.
-    - `batch_size`, `updates_per_decision`, `warmup_decisions` (uniformly random before any update).
+    - `worlds`: worlds in which the policy acts at once; their transitions share one replay. The updates
+      after a decision are the same in number for any of them.
+    - `batch_size`, `updates_per_decision`, `warmup_decisions` (of all worlds, uniformly random before any
+      update).
     - `exploration_noise`: standard deviation, in units of the action range.
     - `hindsight`: share of each batch whose target is replaced by a position reached later.
     - `mirror`: share of each batch reflected left to right.
@@ -45,6 +48,7 @@ class TrainingOptions(eqx.Module):
     bound_values: bool = eqx.field(static=True, default=True)
     replay_action: str = static_field("proposed", one_of("proposed", "executed"))
     filter_gradients: bool = eqx.field(static=True, default=False)
+    worlds: int = static_field(1, least=1)
     decision_steps: int = static_field(10, least=1)
     batch_size: int = static_field(256, least=1)
     updates_per_decision: int = static_field(2, least=1)

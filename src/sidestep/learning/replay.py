@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import Flag, Scalar, real
+from sidestep._arrays import Flag, Lanes, Scalar, real
 from sidestep.learning.td3 import Batch
 from sidestep.world import EvaderModel, Scenario, World, observe, to_action
 from sidestep.world.robots import closest_approach_straight
@@ -27,25 +27,28 @@ class Transition(eqx.Module):
 
     world: World
     next_world: World
-    path: Float[Array, "knots 2"]
-    steps: Int[Array, ""]
-    proposed: Float[Array, "2"]
-    executed: Float[Array, "2"]
-    correction: Scalar
-    lost: Flag
+    path: Float[Array, "knots 2 *lanes"]
+    steps: Int[Array, "*lanes"]
+    proposed: Float[Array, "2 *lanes"]
+    executed: Float[Array, "2 *lanes"]
+    correction: Lanes
+    lost: Bool[Array, "*lanes"]
 
 
 class Replay(eqx.Module):
     """Ring buffer of transitions. `written` counts all transitions so far; slot = count modulo capacity.
 
-    `episode` is the episode of each slot, and `episode_last[e mod len]` the count of the newest transition of
-    episode e, so that a later transition of the same episode is found by one look-up.
+    The `worlds` of a training write one transition each per decision, so the next transition of an episode is
+    `worlds` counts later. `episode` is the episode of each slot, and `episode_last[e mod len]` the count of
+    the newest transition of episode e, so that a later transition of the same episode is found by one
+    look-up. World i of n numbers its episodes i, n + i, 2n + i and so on.
     """
 
     transitions: Transition
     episode: Int[Array, "capacity"]
     episode_last: Int[Array, "episodes"]
     written: Int[Array, ""]
+    worlds: int = eqx.field(static=True, default=1)
 
     @property
     def capacity(self) -> int:
@@ -57,30 +60,43 @@ class Replay(eqx.Module):
         return jnp.minimum(self.written, self.capacity)
 
     @classmethod
-    def init(cls, example: Transition, capacity: int) -> Replay:
-        """An empty ring for transitions shaped like `example`."""
+    def init(cls, example: Transition, capacity: int, worlds: int = 1) -> Replay:
+        """An empty ring for transitions shaped like `example`, of one world; `capacity` is rounded up to a
+        multiple of `worlds`."""
+        capacity += -capacity % worlds
         return cls(
             transitions=jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example),
             episode=jnp.full((capacity,), -1, int),
             episode_last=jnp.zeros((capacity,), int),
             written=jnp.zeros((), int),
+            worlds=worlds,
         )
 
-    def add(self, transition: Transition, episode: Int[Array, ""], active: Flag) -> Replay:
-        """The ring with one more transition of episode number `episode`; unchanged unless `active`.
+    def add(self, transition: Transition, episode: Int[Array, "*lanes"], active: Flag) -> Replay:
+        """The ring with one more transition of each world; unchanged unless `active`.
+
+        **Arguments:** `transition` and `episode`, how many episodes have ended in its world, of one world or
+        of all in lanes.
 
         An inactive write goes out of bounds and is dropped: a conditional would copy the whole ring under
         `vmap`.
         """
-        slot = jnp.where(active, self.written % self.capacity, self.capacity)
+        world, count = jnp.zeros_like(episode), self.written
+        if episode.ndim:
+            world = jnp.arange(self.worlds, dtype=episode.dtype)
+            transition = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), transition)
+            count = count + world
+        episode = episode * self.worlds + world
+        slot = jnp.where(active, count % self.capacity, self.capacity)
         last_slot = jnp.where(active, episode % self.capacity, self.capacity)
         return Replay(
             transitions=jax.tree.map(
                 lambda ring, leaf: ring.at[slot].set(leaf, mode="drop"), self.transitions, transition
             ),
             episode=self.episode.at[slot].set(episode, mode="drop"),
-            episode_last=self.episode_last.at[last_slot].set(self.written, mode="drop"),
-            written=self.written + active.astype(self.written.dtype),
+            episode_last=self.episode_last.at[last_slot].set(count, mode="drop"),
+            written=self.written + self.worlds * active.astype(self.written.dtype),
+            worlds=self.worlds,
         )
 
 
@@ -170,9 +186,9 @@ def sample(
     picked = jax.tree.map(lambda leaf: leaf[slot], replay.transitions)
 
     last = replay.episode_last[replay.episode[slot] % replay.capacity]
-    span = (last - count + 1).astype(reward_scale.dtype)
+    span = ((last - count) // replay.worlds + 1).astype(reward_scale.dtype)
     ahead = jnp.floor(jax.random.uniform(later_key, (batch_size,), dtype=float) * span).astype(count.dtype)
-    later = (jnp.minimum(count + ahead, last)) % replay.capacity
+    later = (jnp.minimum(count + ahead * replay.worlds, last)) % replay.capacity
     # A random control instant of the later decision; the last one is always valid.
     knots = replay.transitions.path[later]
     places = jnp.take_along_axis(

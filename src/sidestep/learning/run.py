@@ -64,7 +64,8 @@ class Training:
 
 
 def _capacity(options: TrainingOptions, scenario: Scenario, episodes: int) -> int:
-    most = episodes * -(-scenario.episode_steps // options.decision_steps)
+    # Every world begins an episode, and the last decision may end one in each.
+    most = (episodes + 2 * options.worlds - 2) * -(-scenario.episode_steps // options.decision_steps)
     return max(1, min(options.replay_capacity, most))
 
 
@@ -76,9 +77,9 @@ def _name(thing: Any) -> str:
 
 def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
     """The lines of `metrics.jsonl` for the episodes that ended in a chunk."""
-    ended = np.flatnonzero(np.asarray(report.ended))
+    ended = np.nonzero(np.asarray(report.ended))
     tally = jax.tree.map(lambda leaf: np.asarray(leaf)[ended], report.tally)
-    outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended]
+    outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended[0]]
     return [
         json_safe(
             {
@@ -96,7 +97,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
                 "mean_correction": tally.correction[i] / tally.steps[i],
             }
         )
-        for i in range(len(ended))
+        for i in range(len(outcome))
     ]
 
 
@@ -206,7 +207,7 @@ def _run(
     elif folder is not None:
         write_checkpoint(folder, state, wall_seconds=0.0)
 
-    curves = None if folder is None else Curves(folder, purge_step=int(state.episodes) + 1)
+    curves = None if folder is None else Curves(folder, purge_step=int(state.ended) + 1)
     begun = saved = time.perf_counter()
     limit = jnp.asarray(episodes)
     interrupted, diverged = False, None
@@ -217,7 +218,7 @@ def _run(
         return records.summarise(metrics, wall_seconds=earlier + time.perf_counter() - begun, **about)
 
     try:
-        while int(state.episodes) < episodes:
+        while int(state.ended) < episodes:
             _interrupts.check()
             chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
             reached, report = run_chunk(scenario, shield, pursuer, options, state, limit, chunk)
@@ -303,8 +304,8 @@ def _reopen(folder: Path, config: Mapping[str, Any], example: TrainState) -> tup
     else:
         state, manifest = read_checkpoint(folder, example)
         wall_seconds = float(manifest["wall_seconds"])
-        if len(records.read_metrics(folder)) != int(state.episodes):
-            records.truncate_metrics(folder, int(state.episodes))
+        if len(records.read_metrics(folder)) != int(state.ended):
+            records.truncate_metrics(folder, int(state.ended))
     if records.open_run(folder)["episodes"] != config["episodes"]:
         write_json(folder / "config.json", config)
     return state, wall_seconds
@@ -318,7 +319,7 @@ def _ended_before(
         policy, summary = load_policy(folder), records.read_summary(folder)
     except records.RunError:
         return None
-    if int(state.episodes) < episodes or summary.get("episodes") != episodes:
+    if int(state.ended) < episodes or summary.get("episodes", 0) < episodes:
         return None
     return Training(policy, summary, metrics, state, folder=folder, had_ended=True)
 

@@ -7,33 +7,43 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from sidestep._arrays import Count, Scalar, real, select
+from sidestep._arrays import Count, Lanes, real, select
 from sidestep.learning.bounds import on_disc, through_shield
+from sidestep.learning.networks import Actor
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Learner, Losses, update
 from sidestep.loop.episode import Episode, Tally, Task, advance, begin, hold
 from sidestep.loop.step import CAPTURED, COLLIDED, nominal_velocity
-from sidestep.world import Scenario, observation_size, observe
+from sidestep.world import Scenario, World, observation_size, observe
 
 
 class TrainState(eqx.Module):
-    """The complete state of a training: a training restored from it continues bitwise equal."""
+    """The complete state of a training: a training restored from it continues bitwise equal.
+
+    **Attributes:** the `episode` that runs, or one in each of many worlds in lanes; `episodes`, how many have
+    ended in each world; `decisions` of each world; `env_steps`, control periods of all worlds.
+    """
 
     learner: Learner
     replay: Replay
     episode: Episode
     key: PRNGKeyArray
-    episodes: Count
+    episodes: Int[Array, "*lanes"]
     decisions: Count
     env_steps: Count
+
+    @property
+    def ended(self) -> Count:
+        """How many episodes have ended."""
+        return jnp.sum(self.episodes)
 
 
 class Report(eqx.Module):
     """The host's data of one decision: the tally, which is the episode's total when `ended`; whether the
-    proposed action was `finite`."""
+    proposed actions were `finite`. After axes of decisions, arrays have one of worlds if there are many."""
 
     ended: Bool[Array, "..."]
     outcome: Int[Array, "..."]
@@ -48,9 +58,21 @@ class _Drive(NamedTuple):
     the evader's `path`."""
 
     end: Episode
-    executed: Float[Array, "2"]
-    correction: Scalar
-    path: Float[Array, "knots 2"]
+    executed: Float[Array, "2 *lanes"]
+    correction: Lanes
+    path: Float[Array, "knots 2 *lanes"]
+
+
+def _reset(scenario: Scenario, worlds: int, key: PRNGKeyArray) -> World:
+    """A start, or many in lanes."""
+    if worlds == 1:
+        return scenario.reset(key)
+    starts = jax.vmap(scenario.reset)(jax.random.split(key, worlds))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), starts)
+
+
+def _proposed(actor: Actor, observation: Float[Array, "observation *lanes"]) -> Float[Array, "2 *lanes"]:
+    return actor(observation[None])[0] if observation.ndim == 1 else actor(observation.T).T
 
 
 @eqx.filter_jit
@@ -63,44 +85,48 @@ def start(
     chunk recompile.
     """
     net_key, reset_key, key = jax.random.split(key, 3)
-    world = scenario.reset(reset_key)
+    world = _reset(scenario, options.worlds, reset_key)
+    one = jax.tree.map(lambda leaf: leaf[..., 0], world) if world.lanes else world
     example = Transition(
-        world=world,
-        next_world=world,
+        world=one,
+        next_world=one,
         path=jnp.zeros((options.decision_steps + 1, 2), world.evader.dtype),
         steps=jnp.zeros((), int),
-        proposed=jnp.zeros_like(world.evader),
-        executed=jnp.zeros_like(world.evader),
+        proposed=jnp.zeros_like(one.evader),
+        executed=jnp.zeros_like(one.evader),
         correction=real(0.0),
         lost=jnp.asarray(False),
     )
     return TrainState(
         learner=options.algorithm.init(observation_size(scenario), 2, net_key),
-        replay=Replay.init(example, capacity),
+        replay=Replay.init(example, capacity, options.worlds),
         episode=begin(shield, world),
         key=key,
-        episodes=jnp.zeros((), int),
+        episodes=jnp.zeros_like(world.time, int),
         decisions=jnp.zeros((), int),
         env_steps=jnp.zeros((), int),
     )
 
 
 def _drive(
-    task: Task, options: TrainingOptions, episode: Episode, nominal: Float[Array, "2"], key: PRNGKeyArray
+    task: Task,
+    options: TrainingOptions,
+    episode: Episode,
+    nominal: Float[Array, "2 *lanes"],
+    key: PRNGKeyArray,
 ) -> _Drive:
     """Hold the nominal velocity for a decision, or until the episode ends."""
 
-    def period(carry: tuple[Episode, Array, Array], key: PRNGKeyArray) -> tuple[Any, Float[Array, "2"]]:
+    def period(carry: tuple[Episode, Array, Array], key: Key[Array, "*lanes"]) -> tuple[Any, Array]:
         episode, *sums = carry
         episode, period = advance(task, episode, key)
         result = period.result
         more = [total + one for total, one in zip(sums, (result.action, result.intervention), strict=True)]
         return (episode, *select(period.running, more, sums)), episode.world.evader
 
-    begun = (hold(episode, nominal), jnp.zeros_like(nominal), real(0.0))
-    (end, executed, correction), places = jax.lax.scan(
-        period, begun, jax.random.split(key, options.decision_steps)
-    )
+    begun = (hold(episode, nominal), jnp.zeros_like(nominal), jnp.zeros_like(nominal[0]))
+    keys = jax.random.split(key, (options.decision_steps, *nominal.shape[1:]))
+    (end, executed, correction), places = jax.lax.scan(period, begun, keys)
     return _Drive(end, executed, correction, jnp.concatenate([episode.world.evader[None], places]))
 
 
@@ -138,19 +164,20 @@ def _learn(
 def decide_and_learn(
     scenario: Scenario, shield: Any, pursuer: Any, options: TrainingOptions, state: TrainState, limit: Count
 ) -> tuple[TrainState, Report]:
-    """One decision of the policy, its control periods, and the updates that follow it.
+    """One decision of the policy in every world, its control periods, and the updates that follow it.
 
-    After `limit` episodes the state does not change, so a training stops exactly at the end of an episode.
+    After `limit` episodes the state does not change, so a training stops exactly at the end of an episode; of
+    many worlds, others may end one in the same decision.
     """
-    active = state.episodes < limit
+    active = state.ended < limit
     world, task = state.episode.world, Task(scenario, None, shield, pursuer)
     key, noise_key, random_key, drive_key, learn_key, reset_key = jax.random.split(state.key, 6)
 
-    wanted = state.learner.actor(observe(scenario, world)[None])[0]
-    noise = options.exploration_noise * jax.random.normal(noise_key, (2,), dtype=float)
+    wanted = _proposed(state.learner.actor, observe(scenario, world))
+    noise = options.exploration_noise * jax.random.normal(noise_key, wanted.shape, dtype=float)
     explored = jnp.clip(wanted + noise, -1.0, 1.0)
-    anything = jax.random.uniform(random_key, (2,), dtype=float, minval=-1.0, maxval=1.0)
-    warm = state.decisions < options.warmup_decisions
+    anything = jax.random.uniform(random_key, wanted.shape, dtype=float, minval=-1.0, maxval=1.0)
+    warm = state.decisions * options.worlds < options.warmup_decisions
     nominal = nominal_velocity(scenario, world, jnp.where(warm, anything, explored))
 
     drive = _drive(task, options, state.episode, nominal, drive_key)
@@ -178,8 +205,8 @@ def decide_and_learn(
     )
 
     ended = ~end.running
-    episode = select(ended, begin(shield, scenario.reset(reset_key)), end)
-    env_steps = state.env_steps + steps.astype(state.env_steps.dtype)
+    episode = select(ended, begin(shield, _reset(scenario, options.worlds, reset_key)), end)
+    env_steps = state.env_steps + jnp.sum(steps).astype(state.env_steps.dtype)
     moved = TrainState(
         learner=learner,
         replay=replay,

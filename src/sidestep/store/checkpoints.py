@@ -137,7 +137,8 @@ def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
 def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> Path:
     """Write the training state as the newest checkpoint; the two newest are kept."""
     folder = Path(folder) / "checkpoints"
-    episodes = int(state.episodes)
+    ended = np.asarray(state.episodes)
+    episodes = int(ended.sum())
     folder.mkdir(exist_ok=True)
     path = folder / f"episodes-{episodes:06d}.npz"
     filled = min(int(state.replay.written), state.replay.capacity)
@@ -147,7 +148,7 @@ def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> 
         rows={
             ".replay.transitions": filled,
             ".replay.episode": filled,
-            ".replay.episode_last": min(episodes + 1, state.replay.capacity),
+            ".replay.episode_last": min((int(ended.max()) + 1) * ended.size, state.replay.capacity),
         },
         episodes=episodes,
         wall_seconds=wall_seconds,
