@@ -41,7 +41,7 @@ def _close(one, other):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-6)
 
 
-@pytest.mark.parametrize("name", [name for name, kind in PURSUERS.items() if kind.takes_lanes])
+@pytest.mark.parametrize("name", [*(name for name, kind in PURSUERS.items() if kind.takes_lanes), "mixed"])
 def test_pursuers_and_motion(name):
     scenario, key = load_scenario("paper", pursuer_count=2, obstacle_count=2), jax.random.key(0)
     worlds, pursuer = _worlds(scenario), make_pursuer(name)
