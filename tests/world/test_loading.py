@@ -21,7 +21,7 @@ NOT_NEGATIVE = [
     "obstacle_separation", "target_separation",
 ]  # fmt: skip
 COUNTS = ["pursuer_count", "obstacle_count", "episode_steps"]
-CHOICES = ["action", "obstacle_directions", "obstacle_motion", "frame"]
+CHOICES = ["action", "obstacle_directions", "obstacle_motion", "frame", "observation"]
 ARRAYS = ["obstacle_velocity", "evader_start", "target_start", "pursuer_starts", "obstacle_starts"]
 
 
@@ -72,6 +72,7 @@ def test_unknown_mode_lists_the_known_ones(field, value):
         "obstacle_directions": "'random'",
         "obstacle_motion": "'adversarial'",
         "frame": "'world'",
+        "observation": "'motion'",
     }[field]
     refused(repr(value), known, **{field: value})
 
@@ -179,6 +180,7 @@ CHANGED = {
     "evader_speed": 0.16,
     "action": "heading",
     "frame": "world",
+    "observation": "motion",
     "obstacle_directions": "random",
     "obstacle_motion": "adversarial",
     "episode_steps": 77,

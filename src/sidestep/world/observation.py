@@ -9,6 +9,7 @@ are the world's. Entries are scaled to about [-1, 1]; "squashed" means p/(1 + |p
 | 2 | tanh(d/2), exp(-d/0.25): far and near view of the distance d to the target (m) |
 | 2 | direction of the target (cos, sin); only with `frame="world"` |
 | 5 per pursuer | position squashed (2), heading (cos, sin), exp(-c/0.2) for its clearance c (m) |
+| 2 more per pursuer | wheel speeds (left, right) of the last period / V; only with `observation="motion"` |
 | 5 per obstacle | position squashed (2), velocity / v_e (2), exp(-c/0.2) for its clearance c (m) |
 
 Pursuers and obstacles are sorted, nearest first, so their order in the world has no effect. The policy's
@@ -31,8 +32,9 @@ FAR_TARGET, NEAR_TARGET, NEAR_ROBOT = 2.0, 0.25, 0.2
 
 
 def observation_size(scenario: Scenario) -> int:
-    """Number of entries of `observe`: 2 (4 with `frame="world"`) + 5 m + 5 k."""
-    return (2 if scenario.frame == "target" else 4) + 5 * (scenario.pursuer_count + scenario.obstacle_count)
+    """Number of entries of `observe`: 2 (4 with `frame="world"`) + 5 m (7 m with `observation="motion"`) + 5
+    k."""
+    return len(observation_names(scenario))
 
 
 def observation_names(scenario: Scenario) -> list[str]:
@@ -42,6 +44,8 @@ def observation_names(scenario: Scenario) -> list[str]:
         names += ["target_cos", "target_sin"]
     for i in range(scenario.pursuer_count):
         names += [f"pursuer{i}_{part}" for part in ("x", "y", "cos", "sin", "near")]
+        if scenario.observation == "motion":
+            names += [f"pursuer{i}_{wheel}" for wheel in ("left", "right")]
     for i in range(scenario.obstacle_count):
         names += [f"obstacle{i}_{part}" for part in ("x", "y", "vx", "vy", "near")]
     return names
@@ -79,9 +83,13 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
         return axes[0, 0] * x + axes[0, 1] * y, axes[1, 0] * x + axes[1, 1] * y
 
     def block(
-        robots: Float[AnyArray, "n d *lanes"], extra: Callable[[Any], tuple[Lanes, Lanes]], contact: Scalar
+        robots: Float[AnyArray, "n d *lanes"],
+        extra: Callable[[Any], tuple[Lanes, Lanes]],
+        contact: Scalar,
+        more: Callable[[Any], list[Lanes]] = lambda robot: [],
     ) -> list[Lanes]:
-        """Entries of all robots of a kind; `extra` gives each robot's second vector, in world axes."""
+        """Entries of all robots of a kind; `extra` gives each robot's second vector, in world axes, and
+        `more` what comes last."""
         distances = [length(robot[0] - world.evader[0], robot[1] - world.evader[1]) for robot in robots]
         if len(distances) > 1:
             order = jnp.argsort(jnp.stack(distances), axis=0)
@@ -93,6 +101,7 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
             entries += along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash)
             entries += along(*extra(robot))
             entries.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / NEAR_ROBOT))
+            entries += more(robot)
         return entries
 
     def heading(robot: Any) -> tuple[Lanes, Lanes]:
@@ -101,7 +110,13 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
     def drift(robot: Any) -> tuple[Lanes, Lanes]:
         return robot[2] / scenario.evader_speed, robot[3] / scenario.evader_speed
 
-    entries += block(world.pursuers, heading, scenario.capture_distance)
+    def wheels(robot: Any) -> list[Lanes]:
+        return [jnp.clip(wheel / scenario.pursuer_speed, -1.0, 1.0) for wheel in robot[3:]]
+
+    pursuers = world.pursuers
+    if scenario.observation == "motion":
+        pursuers = jnp.concatenate([pursuers, world.wheel_speeds], axis=1)
+    entries += block(pursuers, heading, scenario.capture_distance, wheels)
     entries += block(world.obstacles, drift, scenario.collision_distance)
     return stack(*entries)
 
