@@ -5,13 +5,14 @@ import json
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sidestep.commands.common import parse_overrides
 from sidestep.learning import TD3, TrainingOptions, make_options, options_to_dict
 
-SHARES = {"hindsight", "mirror", "discount", "target_rate"}
+SHARES = {"hindsight", "mirror", "discount", "target_rate", "anneal"}
 NOT_NEGATIVE = {
     "exploration_noise",
     "reward_scale",
@@ -29,6 +30,7 @@ WHOLE = {
     "warmup_decisions",
     "replay_capacity",
     "policy_delay",
+    "worlds",
 }
 OTHERS = {"hidden", "replay_action", "bound_values", "filter_gradients"}
 ALL = {field.name for owner in (TD3, TrainingOptions) for field in dataclasses.fields(owner)} - {"algorithm"}
@@ -99,6 +101,19 @@ def test_each_option_arrives_alone_and_comes_back_from_json(precision, name):
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(options), strict=True):
         assert ours.dtype == theirs.dtype == (np.float64 if precision else np.float32)
         assert ours == theirs
+
+
+def test_learning_rates_fall_over_the_last_share_of_the_episodes_only(precision):
+    options = make_options(anneal=0.25, actor_learning_rate=1e-3, critic_learning_rate=4e-3)
+    for done, share in ((0, 1.0), (149, 1.0), (150, 1.0), (175, 0.525), (200, 0.05)):
+        algorithm = options.after(jnp.asarray(done), jnp.asarray(200)).algorithm
+        assert float(algorithm.actor_learning_rate) == pytest.approx(share * 1e-3)
+        assert float(algorithm.critic_learning_rate) == pytest.approx(share * 4e-3)
+    plain = make_options()
+    for done in (0, 100, 200):
+        # To the last bit.
+        after = plain.after(jnp.asarray(done), jnp.asarray(200))
+        assert all(np.array_equal(*pair) for pair in zip(*map(jax.tree.leaves, (plain, after)), strict=True))
 
 
 @pytest.mark.parametrize("given", [{}, {"replay_action": "proposed"}])

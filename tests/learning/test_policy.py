@@ -113,6 +113,24 @@ def test_curves_interrupted_anywhere_hold_whole_chunks_and_leave_nothing_to_wait
     assert threading.active_count() == threads
 
 
+def test_curves_of_many_worlds_hold_one_mean_per_chunk(tmp_path):
+    losses = SimpleNamespace(critic=np.ones(2), actor=np.ones(2), value=np.ones(2))
+    lines = [
+        {"episode": 4, "outcome": "reached", "return": 5.0, "steps": 7, "clearance": None},
+        {"episode": 5, "outcome": "captured", "return": 2.0, "steps": 8, "clearance": 0.25},
+    ]
+    curves = Curves(tmp_path, 1, averaged=True)
+    curves.write(lines, losses)
+    curves.write([], losses)
+    episodes = {
+        name: value for (step, name), value in read_events(tmp_path / "curves").items() if "episode/" in name
+    }
+    assert {step for step, _ in read_events(tmp_path / "curves")} == {5}
+    assert episodes == {
+        "episode/return": 3.5, "episode/steps": 7.5, "episode/reached": 0.5, "episode/clearance": 0.25,
+    }  # fmt: skip
+
+
 @pytest.mark.slow
 def test_curves_hold_each_episode_once_even_after_a_resume(small, tmp_path, monkeypatch):
     calls = []

@@ -20,15 +20,28 @@ def _protos() -> Any:
     return event_pb2
 
 
+def _mean(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """The means of these lines, as one line for the last of them."""
+    names = [name for name in lines[-1] if name not in ("episode", "outcome")]
+    values = {name: [line[name] for line in lines if line[name] is not None] for name in names}
+    return {
+        "episode": lines[-1]["episode"],
+        **{name: float(np.mean(some)) for name, some in values.items() if some},
+    }
+
+
 class Curves:
     """Scalars over episodes: return, steps, clearances, interventions, losses.
+
+    With `averaged`, the means of the episodes of a chunk at the last of them: many worlds end tens of
+    thousands of episodes.
 
     Does not use tensorboardX's `SummaryWriter`: an interrupt while that passes an event to its thread can
     make its `close` wait forever.
     """
 
-    def __init__(self, folder: str | Path, purge_step: int):
-        event = _protos()
+    def __init__(self, folder: str | Path, purge_step: int, averaged: bool = False):
+        event, self._averaged = _protos(), averaged
         place = Path(folder) / "curves"
         make_folder(place)
         # The time in a file's name is in s; the count keeps a resume within that second from overwriting.
@@ -49,11 +62,11 @@ class Curves:
         from tensorboardX.summary import scalar
 
         entries: list[tuple[str, float, int]] = []
-        for line in lines:
-            for name, value in line.items():
+        points = [{**line, "reached": float(line["outcome"] == "reached")} for line in lines]
+        for point in [_mean(points)] if self._averaged and points else points:
+            for name, value in point.items():
                 if name not in ("episode", "outcome") and value is not None:
-                    entries.append((f"episode/{name}", value, line["episode"]))
-            entries.append(("episode/reached", float(line["outcome"] == "reached"), line["episode"]))
+                    entries.append((f"episode/{name}", float(value), point["episode"]))
         if lines:
             for name in ("critic", "actor", "value"):
                 mean = float(np.mean(getattr(losses, name)))

@@ -7,8 +7,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
-from sidestep._arrays import Scalar, real, static_field
+from sidestep._arrays import Count, Scalar, real, static_field
 from sidestep._bounds import Bound, allowed, did_you_mean, one_of, taken, within
 from sidestep.learning.td3 import TD3
 
@@ -36,6 +37,8 @@ class TrainingOptions(eqx.Module):
     - `correction_penalty`: subtracted from the reward of a decision whose mean correction is v_e, in
       proportion to the correction, in units of the paper's reward. It penalises the proposed action; a critic
       of executed actions attributes it to the executed one.
+    - `anneal`: share of the episodes, at the end of the training, over which both learning rates fall to a
+      twentieth, linearly; a training that is resumed for more episodes raises them again.
     - `replay_capacity`: largest number of transitions kept; never more than the training can produce.
     """
 
@@ -45,6 +48,7 @@ class TrainingOptions(eqx.Module):
     reward_scale: Scalar = eqx.field(converter=real, default=0.01, metadata=within(least=0.0))
     correction_penalty: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0))
     mirror: Scalar = eqx.field(converter=real, default=0.5, metadata=within(least=0.0, most=1.0))
+    anneal: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0, most=1.0))
     bound_values: bool = eqx.field(static=True, default=True)
     replay_action: str = static_field("proposed", one_of("proposed", "executed"))
     filter_gradients: bool = eqx.field(static=True, default=False)
@@ -54,6 +58,16 @@ class TrainingOptions(eqx.Module):
     updates_per_decision: int = static_field(2, least=1)
     warmup_decisions: int = static_field(256, least=1)
     replay_capacity: int = static_field(1_000_000, least=1)
+
+    def after(self, done: Count, episodes: Count) -> TrainingOptions:
+        """The options after `done` of `episodes` episodes: with the learning rates of then."""
+        left = 1.0 - done.astype(self.anneal.dtype) / episodes.astype(self.anneal.dtype)
+        share = jnp.where(left < self.anneal, 0.05 + 0.95 * left / jnp.maximum(self.anneal, 1e-6), 1.0)
+
+        def rates(options: TrainingOptions) -> tuple[Any, Any]:
+            return options.algorithm.actor_learning_rate, options.algorithm.critic_learning_rate
+
+        return eqx.tree_at(rates, self, tuple(share * rate for rate in rates(self)))
 
     def __check_init__(self) -> None:
         if self.filter_gradients and self.replay_action != "executed":

@@ -28,8 +28,9 @@ from sidestep.store.checkpoints import list_checkpoints, read_checkpoint, write_
 from sidestep.store.files import OutputError, json_safe, write_json
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
-CHUNK = 100
-"""Decisions per compiled call: about 0.5 s, so that progress and Ctrl-C respond quickly."""
+CHUNK, CHUNK_OF_MANY = 100, 20
+"""Decisions per compiled call, of one world and of each of many: some 0.5 s, so that progress and Ctrl-C
+respond quickly."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def train(
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     checkpoint_seconds: float = 20.0,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
 ) -> Training:
     """Train a policy with TD3 behind a shield.
 
@@ -143,7 +144,7 @@ def train(
 
     **Arguments:** `shield` and `pursuer` names or objects; `resume` continues the run in `out`, with the
     stored scenario, shield, pursuer, seed and options (`resume_settings` reads them), while `episodes` may be
-    larger; `progress` is called after every chunk of `chunk` decisions.
+    larger; `progress` is called after every chunk of `chunk` decisions (by default what takes some 0.5 s).
 
     The folder is locked until the last file is written. A run that has all its episodes is not changed. A
     damaged checkpoint is skipped with a `DamageWarning`.
@@ -154,9 +155,11 @@ def train(
     finite. After the last two the newest checkpoint is kept, and the run can be resumed from it.
     """
     whole_number("episodes", episodes)
-    whole_number("chunk", chunk)
     seed_number(seed)
     options = make_options() if options is None else options
+    if chunk is None:
+        chunk = CHUNK if options.worlds == 1 else CHUNK_OF_MANY
+    whole_number("chunk", chunk)
     names = {"shield": _name(shield), "pursuer": _name(pursuer)}
     shield, pursuer = as_shield(shield, scenario), as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)
@@ -207,7 +210,9 @@ def _run(
     elif folder is not None:
         write_checkpoint(folder, state, wall_seconds=0.0)
 
-    curves = None if folder is None else Curves(folder, purge_step=int(state.ended) + 1)
+    curves = None
+    if folder is not None:
+        curves = Curves(folder, purge_step=int(state.ended) + 1, averaged=options.worlds > 1)
     begun = saved = time.perf_counter()
     limit = jnp.asarray(episodes)
     interrupted, diverged = False, None

@@ -197,9 +197,10 @@ def decide_and_learn(
         state.episodes,
         active,
     )
+    now = options.after(state.ended, limit)
     learner, losses = jax.lax.cond(
         active & ~warm,
-        lambda learner: _learn(scenario, shield, options, learner, replay, learn_key),
+        lambda learner: _learn(scenario, shield, now, learner, replay, learn_key),
         lambda learner: (learner, Losses(real(0.0), real(0.0), real(0.0))),
         state.learner,
     )
