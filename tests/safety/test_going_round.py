@@ -122,6 +122,7 @@ def crowd(scenario):
     return worlds, nominal
 
 
+@pytest.mark.slow
 def test_going_round_violates_no_row_that_can_be_kept(scenario, crowd):
     worlds, nominal = crowd
     game, plain = make_shield("game", scenario), GameShield(scenario)

@@ -51,6 +51,7 @@ def _chase(scenario, shield, pursuer, worlds, periods):
     return np.asarray(chase(begin)[1][2]).T
 
 
+@pytest.mark.slow
 def test_where_the_rows_alone_collide_the_look_ahead_does_not():
     scenario = load_scenario("paper")
     worlds, nash = _starts(scenario, LOST_BY_GAME), make_pursuer("nash")
@@ -74,7 +75,7 @@ def test_two_pursuers_close_in_on_the_rows_and_not_on_the_look_ahead():
     assert not captured.any()
 
 
-@pytest.mark.parametrize("acceleration", [None, 2.0])
+@pytest.mark.parametrize("acceleration", [None, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_an_imagined_chase_is_the_chase_that_follows(acceleration):
     """In the robot's own period, against the pursuer that is there, imagination must be exact."""
     scenario = load_scenario("paper", obstacle_count=2)

@@ -238,6 +238,7 @@ def _chased(shield, drift, count=48, seconds=20.0):
     return [OUTCOMES[i] if i >= 0 else "running" for i in np.asarray(chases.outcome)]
 
 
+@pytest.mark.slow
 def test_the_tables_own_worst_case_and_a_hunting_obstacle_lose_to_it_and_beat_the_rows():
     assert set(_chased(SHIELD, 0.02)) == {"timed_out"}
     behind_rows = _chased(make_shield("game", SCENARIO), 0.02)
