@@ -29,7 +29,7 @@ from sidestep.store.checkpoints import (
 )
 from sidestep.store.damage import DamageWarning
 from sidestep.store.files import read_json
-from sidestep.store.runs import RunError, read_metrics, read_summary
+from sidestep.store.runs import RunError, open_run, read_metrics, read_summary
 from sidestep.world import scenario_to_dict
 
 
@@ -444,3 +444,51 @@ def test_resume_settings_are_those_the_run_was_begun_with(small, whole):
         0,
         8,
     )
+
+
+# Warm starts --------------------------------------------------------------------------------------------
+
+
+def test_warm_start_begins_with_the_networks_of_the_other_run_and_an_empty_replay(small, tmp_path):
+    first = small.train(out=tmp_path / "first")
+    steps = []
+    second = small.train(
+        shield="none", out=tmp_path / "second", warm_start=tmp_path / "first", progress=steps.append
+    )
+    assert int(second.state.learner.updates) > int(first.state.learner.updates)
+    begun, _ = read_checkpoint(tmp_path / "second", second.state)
+    assert small.differences(begun.learner, second.state.learner) == []
+    alone = small.train(shield="none")
+    assert small.differences(alone.policy, second.policy) != []
+    config = open_run(tmp_path / "second")
+    assert config["warm_start"] == str(tmp_path / "first")
+    # From the first decision on it is the learned policy that acts, not a random one.
+    assert second.metrics[0] != alone.metrics[0]
+
+
+def test_warm_start_interrupted_and_resumed_is_the_same_training(small, tmp_path):
+    small.train(out=tmp_path / "first")
+    whole = small.train(out=tmp_path / "whole", warm_start=tmp_path / "first")
+
+    def interrupt(progress):
+        if progress.episode >= 3:
+            raise KeyboardInterrupt
+
+    small.train(out=tmp_path / "parts", warm_start=tmp_path / "first", progress=interrupt)
+    settings = resume_settings(tmp_path / "parts")
+    assert settings["warm_start"] == str(tmp_path / "first")
+    again = small.train(out=tmp_path / "parts", warm_start=settings["warm_start"], resume=True)
+    assert again.metrics == whole.metrics
+    assert small.differences(again.state, whole.state) == []
+    with pytest.raises(RunError, match="warm_start"):
+        small.train(out=tmp_path / "parts", resume=True)
+
+
+def test_warm_start_that_does_not_fit_is_refused_before_anything_is_written(small, tmp_path):
+    small.train(out=tmp_path / "first", episodes=1)
+    other = small.scenario(obstacle_count=2)
+    with pytest.raises(CheckpointError, match="needed"):
+        small.train(other, out=tmp_path / "second", warm_start=tmp_path / "first")
+    with pytest.raises(RunError, match="name the run folder of a training"):
+        small.train(out=tmp_path / "second", warm_start=tmp_path / "nothing")
+    assert not (tmp_path / "second").exists()

@@ -41,8 +41,8 @@ class Train:
     shield: ShieldName = unless_given("joint")
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = unless_given("nash")
-    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; chauffeur
-    for robots that cannot turn on the spot."""
+    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; mixed, one
+    after another; chauffeur for robots that cannot turn on the spot."""
     episodes: int = bounded(unless_given(200), EPISODES)
     """Training episodes; with --resume the new total, if larger."""
     seed: int = bounded(unless_given(0), SEED)
@@ -51,6 +51,8 @@ class Train:
     """Scenario fields to change, such as evader_speed=0.18 obstacle_count=2."""
     learner: Overrides = ()
     """Training options to change, such as discount=0.98 updates_per_decision=3."""
+    warm_start: Path | None = None
+    """Run folder whose networks the training begins with, such as one behind a cheaper shield."""
     resume: bool = False
     """Resume the run in --out, bit for bit, with its stored settings. Other options must agree with those."""
     json: Path | None = None
@@ -67,7 +69,9 @@ def run(command: Train, console: Console) -> int:
     going = going_on(console, command.out, *resume_words("train", command.out, command.json))
     with going:
         stored = resume_settings(command.out) if command.resume else None
-        settings = settings_from(command, "shield", "pursuer", "seed", "episodes", stored=stored)
+        settings = settings_from(
+            command, "shield", "pursuer", "seed", "episodes", "warm_start", stored=stored
+        )
         settings["scenario"] = scenario_from(command, settings.get("scenario"))
         settings["options"] = options_from(command, settings.get("options"))
         with TrainingBar(console, f"training, {settings['shield']}") as show:

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,17 +21,21 @@ from sidestep.learning.curves import Curves
 from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
+from sidestep.learning.td3 import Learner
 from sidestep.learning.training import Report, TrainState, run_chunk, start
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.store import runs as records
-from sidestep.store.checkpoints import list_checkpoints, read_checkpoint, write_checkpoint
+from sidestep.store.checkpoints import list_checkpoints, read_checkpoint, read_part, write_checkpoint
 from sidestep.store.files import OutputError, json_safe, write_json
-from sidestep.world import Scenario, load_scenario, scenario_to_dict
+from sidestep.world import Scenario, load_scenario, observation_size, scenario_to_dict
 
 CHUNK, CHUNK_OF_MANY = 100, 20
 """Decisions per compiled call, of one world and of each of many: some 0.5 s, so that progress and Ctrl-C
 respond quickly."""
+
+
+_SETTINGS = ("scenario", "learner", "shield", "pursuer", "seed", "warm_start")
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
         "seed": config["seed"],
         "episodes": config["episodes"],
         "options": make_options(**config["learner"]),
+        "warm_start": config.get("warm_start"),
     }
 
 
@@ -134,6 +140,7 @@ def train(
     progress: Callable[[Progress], None] | None = None,
     checkpoint_seconds: float = 20.0,
     chunk: int | None = None,
+    warm_start: str | Path | None = None,
 ) -> Training:
     """Train a policy with TD3 behind a shield.
 
@@ -146,13 +153,17 @@ def train(
     stored scenario, shield, pursuer, seed and options (`resume_settings` reads them), while `episodes` may be
     larger; `progress` is called after every chunk of `chunk` decisions (by default what takes some 0.5 s).
 
+    With `warm_start`, another run's folder, the learner begins with the networks and moments of its newest
+    checkpoint and an empty replay: for another shield, pursuer or scenario with equal observations.
+
     The folder is locked until the last file is written. A run that has all its episodes is not changed. A
     damaged checkpoint is skipped with a `DamageWarning`.
 
     **Raises** `ValueError` for an invalid argument; `RunError` when `out` is occupied and `resume` is not
-    set, has nothing to resume, or has other settings; `FolderInUseError` when another process writes there;
-    `OutputError` when the run cannot be written any more; `Diverged` when networks, losses or actions are not
-    finite. After the last two the newest checkpoint is kept, and the run can be resumed from it.
+    set, has nothing to resume, or has other settings, or when `warm_start` holds no training that fits;
+    `FolderInUseError` when another process writes there; `OutputError` when the run cannot be written any
+    more; `Diverged` when networks, losses or actions are not finite. After the last two the newest checkpoint
+    is kept, and the run can be resumed from it.
     """
     whole_number("episodes", episodes)
     seed_number(seed)
@@ -171,20 +182,36 @@ def train(
         "episodes": int(episodes),
         "version": __version__,
     }
-    folder = None if out is None else Path(out)
+    folder, learner = None if out is None else Path(out), None
+    if warm_start is not None:
+        config["warm_start"] = str(Path(warm_start).absolute())
+        if not (resume and folder is not None and list_checkpoints(folder)):
+            learner = _learner_of(warm_start, scenario, options)
+    setup = _Setup(scenario, shield, pursuer, options, capacity, learner)
     with nullcontext() if folder is None else records.writing(folder, resume=resume):
-        return _run(
-            scenario, shield, pursuer, options, capacity, config, folder, resume, progress,
-            checkpoint_seconds, chunk,
-        )  # fmt: skip
+        return _run(setup, config, folder, resume, progress, checkpoint_seconds, chunk)
+
+
+class _Setup(NamedTuple):
+    """What is trained; `learner` to begin with, None for a new one."""
+
+    scenario: Scenario
+    shield: Any
+    pursuer: Any
+    options: TrainingOptions
+    capacity: int
+    learner: Learner | None
+
+
+def _learner_of(run: str | Path, scenario: Scenario, options: TrainingOptions) -> Learner:
+    """The learner of another training. **Raises** `RunError` if it does not fit."""
+    records.open_run(run, otherwise="name the run folder of a training")
+    example = options.algorithm.init(observation_size(scenario), 2, jax.random.key(0))
+    return read_part(run, "learner", example)
 
 
 def _run(
-    scenario: Scenario,
-    shield: Any,
-    pursuer: Any,
-    options: TrainingOptions,
-    capacity: int,
+    setup: _Setup,
     config: dict[str, Any],
     folder: Path | None,
     resume: bool,
@@ -193,12 +220,15 @@ def _run(
     chunk: int,
 ) -> Training:
     """The training, with its folder locked."""
+    scenario, shield, pursuer, options, capacity, learner = setup
     episodes = int(config["episodes"])
     if folder is not None and resume:
         _check_same_run(folder, config)
     elif folder is not None:
         records.create_run(folder, config)
     state = start(scenario, shield, options, jax.random.key(config["seed"]), capacity)
+    if learner is not None:
+        state = eqx.tree_at(lambda state: state.learner, state, learner)
     metrics: list[dict[str, Any]] = []
     earlier = 0.0
     if folder is not None and resume:
@@ -292,7 +322,7 @@ def _kept(folder: Path) -> str:
 def _check_same_run(folder: Path, config: Mapping[str, Any]) -> None:
     """**Raises** `RunError` naming the settings that differ from the run in `folder`."""
     stored = records.open_run(folder, "run", otherwise=records.NOT_BEGUN)
-    records.refuse_changes(folder, stored, config, ("scenario", "learner", "shield", "pursuer", "seed"))
+    records.refuse_changes(folder, stored, config, _SETTINGS)
     if config["episodes"] < stored["episodes"]:
         raise records.RunError(
             f"{folder} was begun for {stored['episodes']} episodes; it cannot be resumed for fewer "

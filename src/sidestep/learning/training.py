@@ -178,7 +178,9 @@ def decide_and_learn(
     explored = jnp.clip(wanted + noise, -1.0, 1.0)
     anything = jax.random.uniform(random_key, wanted.shape, dtype=float, minval=-1.0, maxval=1.0)
     warm = state.decisions * options.worlds < options.warmup_decisions
-    nominal = nominal_velocity(scenario, world, jnp.where(warm, anything, explored))
+    # A learner that another training has begun does not start with random actions.
+    begun = state.learner.updates > 0
+    nominal = nominal_velocity(scenario, world, jnp.where(warm & ~begun, anything, explored))
 
     drive = _drive(task, options, state.episode, nominal, drive_key)
     end, steps = drive.end, drive.end.tally.steps - state.episode.tally.steps

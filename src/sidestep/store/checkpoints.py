@@ -109,15 +109,25 @@ def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
     **Raises** `CheckpointError` when the file is damaged or does not match `example`.
     """
     arrays, manifest = read_named(path)
+    tree = _filled(path, arrays, manifest["rows"], example)
+    if arrays:
+        raise CheckpointError(f"{path} holds {', '.join(list(arrays)[:3])} that this version does not know")
+    return tree, manifest
+
+
+def _filled(
+    path: Path, arrays: dict[str, np.ndarray], rows: dict[str, int], example: Tree, at: str = ""
+) -> Tree:
+    """The part of a stored pytree at the name `at`, with the shapes of `example`; takes its arrays out."""
     leaves = []
-    for name, leaf in _named_leaves(example):
+    for name, leaf in ((at + name, leaf) for name, leaf in _named_leaves(example)):
         wanted = _plain(leaf)
         if name not in arrays:
             raise CheckpointError(
                 f"{path} lacks {name}: it was written by another version or with other options"
             )
         array = arrays.pop(name)
-        if _rows_of(name, manifest["rows"]) is not None and array.shape[1:] == wanted.shape[1:]:
+        if _rows_of(name, rows) is not None and array.shape[1:] == wanted.shape[1:]:
             array = np.concatenate([array, wanted[len(array) :]])
         if array.shape != wanted.shape or array.dtype != wanted.dtype:
             raise CheckpointError(
@@ -129,9 +139,7 @@ def read_arrays(path: Path, example: Tree) -> tuple[Tree, dict[str, Any]]:
         if _is_key(leaf):
             value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
         leaves.append(value)
-    if arrays:
-        raise CheckpointError(f"{path} holds {', '.join(list(arrays)[:3])} that this version does not know")
-    return jax.tree.unflatten(jax.tree.structure(example), leaves), manifest
+    return jax.tree.unflatten(jax.tree.structure(example), leaves)
 
 
 def write_checkpoint(folder: str | Path, state: Any, *, wall_seconds: float) -> Path:
@@ -162,6 +170,22 @@ def list_checkpoints(folder: str | Path) -> list[Path]:
     """Checkpoints of a run, oldest first."""
     found = [path for path in (Path(folder) / "checkpoints").glob("*.npz") if _NAME.fullmatch(path.name)]
     return sorted(found, key=_episodes_of)
+
+
+def read_part(folder: str | Path, part: str, example: Tree) -> Tree:
+    """One part of the training state in the newest valid checkpoint of a run, such as `"learner"`.
+
+    **Raises** `CheckpointError` when no checkpoint is valid, or the part does not match `example`.
+    """
+    problem: CheckpointError | None = None
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            arrays, manifest = read_named(path)
+        except CheckpointError as error:
+            problem = problem or error
+            continue
+        return _filled(path, arrays, manifest["rows"], example, f".{part}")
+    raise problem or CheckpointError(f"{folder} has no checkpoint")
 
 
 def _episodes_of(path: Path) -> int:

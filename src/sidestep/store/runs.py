@@ -146,7 +146,7 @@ def refuse_changes(
     **Raises** `RunError` with the first of `names` that differs, and both values.
     """
     for name in names:
-        was, now = json_safe(stored.get(name)), json_safe(asked[name])
+        was, now = json_safe(stored.get(name)), json_safe(asked.get(name))
         if was == now:
             continue
         what = name
