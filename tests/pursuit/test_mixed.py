@@ -75,12 +75,16 @@ def test_draws_are_those_of_the_episode():
 def test_effort_and_agility_are_what_was_asked_for():
     targets = np.random.default_rng(1).uniform(-1.5, 1.5, (4000, 2))
     one = (Constant(wheels=(0.2, 0.2)),)
-    efforts = drawn(Mixed(one, least_effort=0.5, least_agility=1.0), targets, np.zeros(4000))[:, 0] / 0.2
+    efforts = (
+        drawn(Mixed(one, full=0.5, least_effort=0.5, least_agility=1.0), targets, np.zeros(4000))[:, 0] / 0.2
+    )
     assert efforts.min() >= 0.5 - 1e-6
     assert np.mean(efforts > 1.0 - 1e-6) == pytest.approx(0.5, abs=0.04)
     assert np.mean(efforts < 0.75) == pytest.approx(0.25, abs=0.04)
     # From -V: what is left of the old wheel speeds shows the agility.
-    moved = drawn(Mixed(one, least_effort=1.0, least_agility=0.2), targets, np.zeros(4000), (-0.2, -0.2))
+    moved = drawn(
+        Mixed(one, full=0.5, least_effort=1.0, least_agility=0.2), targets, np.zeros(4000), (-0.2, -0.2)
+    )
     agilities = (moved[:, 0] + 0.2) / 0.4
     assert agilities.min() >= 0.2 - 1e-6
     assert np.mean(agilities > 1.0 - 1e-6) == pytest.approx(0.5, abs=0.04)

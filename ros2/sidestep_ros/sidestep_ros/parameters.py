@@ -210,7 +210,7 @@ SHIELD = (Parameter("nominal.topic", "cmd_vel_nominal", "Topic of the command to
 """Parameters of the shield node only."""
 
 POLICY = (
-    Parameter("policy", "goal-seeking", "goal-seeking, or the folder of a training run."),
+    Parameter("policy", "goal-seeking", "goal-seeking, pretrained, or the folder of a training run."),
     Parameter("target", [0.0, 0.0], "Target: x and y (m) in the fixed frame.", live=True),
     Parameter("target_topic", "target", "PoseStamped topic with new targets."),
     Parameter("nominal_only", False, "Publish the policy's nominal command, for a shield node to filter."),

@@ -35,8 +35,10 @@ class PolicyNode(OnboardNode):
         from sidestep.robot import Onboard
 
         policy = self.values["policy"]
-        if policy != "goal-seeking" and not Path(policy).is_dir():
-            raise ConfigurationError([f"'policy' is '{policy}', neither goal-seeking nor a run's folder"])
+        if policy not in ("goal-seeking", "pretrained") and not Path(policy).is_dir():
+            raise ConfigurationError(
+                [f"'policy' is '{policy}', neither goal-seeking, pretrained nor a run's folder"]
+            )
         shield = "none" if self.values["nominal_only"] else self.values["shield"]
         return Onboard(self.scenario, shield=shield, policy=policy, settings=settings)
 

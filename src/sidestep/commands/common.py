@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from sidestep.world import Scenario
 
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=VALUE ...]")]
+PolicyOption = Annotated[str, tyro.conf.arg(metavar="RUN|pretrained|goal-seeking")]
+PolicyName = Annotated[PolicyOption, tyro.conf.Positional]
 PursuerName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 ShieldName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 ScenarioName = Annotated[str, tyro.conf.arg(metavar="NAME|FILE")]
@@ -114,13 +116,13 @@ def scenario_overrides(pairs: tuple[str, ...], *, zero: bool = False) -> dict[st
 def policy_and_scenario(
     run: str, scenario: str | None, overrides: tuple[str, ...]
 ) -> tuple[Any, Scenario, dict[str, Any]]:
-    """The policy of `run` (a folder, a policy file, or goal-seeking), and as `scenario_of_run`."""
+    """The policy of `run` (a folder, a policy file, pretrained or goal-seeking), and as `scenario_of_run`."""
     if run == "goal-seeking":
         return run, *scenario_of_run(None, scenario, overrides)
-    from sidestep.learning import load_policy
+    from sidestep.learning import PRETRAINED, load_policy
 
-    if not Path(run).exists():
-        raise ValueError(f"{run} does not exist; name a run folder, a policy.npz or goal-seeking")
+    if run != PRETRAINED and not Path(run).exists():
+        raise ValueError(f"{run} does not exist; name a run folder, a policy.npz, pretrained or goal-seeking")
     return load_policy(run), *scenario_of_run(run, scenario, overrides)
 
 
@@ -128,15 +130,20 @@ def scenario_of_run(
     run: str | None, scenario: str | None, overrides: tuple[str, ...]
 ) -> tuple[Scenario, dict[str, Any]]:
     """The scenario for a policy (`scenario` if given, else that of the run folder, else paper), and the
-    configuration in the run folder."""
+    configuration in the run folder. What the policy observes is that of its training, unless changed."""
+    from sidestep.learning import PRETRAINED, PRETRAINED_SCENARIO
     from sidestep.store.runs import open_run
     from sidestep.world import load_scenario
 
     changes = scenario_overrides(overrides)
+    if run == PRETRAINED:
+        return load_scenario(scenario or "paper", **{**PRETRAINED_SCENARIO, **changes}), {}
     config = open_run(run) if run is not None and Path(run).is_dir() else {}
     if scenario is None and config:
         return load_scenario("paper", **{**config["scenario"], **changes}), config
-    return load_scenario(scenario or "paper", **changes), config
+    stored = config.get("scenario", {})
+    seen = {name: stored[name] for name in ("frame", "observation") if name in stored}
+    return load_scenario(scenario or "paper", **{**seen, **changes}), config
 
 
 @contextmanager

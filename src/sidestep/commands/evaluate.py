@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from sidestep._bounds import EPISODES, SEED, SIDE_BY_SIDE, bounded
-from sidestep.commands.common import CountBar, Overrides, policy_and_scenario, stood_still, write_json_file
+from sidestep.commands.common import (
+    CountBar,
+    Overrides,
+    PolicyName,
+    policy_and_scenario,
+    stood_still,
+    write_json_file,
+)
 from sidestep.commands.video import NO_VIDEO, VideoOptions, check_options, write_video
 
 if TYPE_CHECKING:
@@ -22,8 +29,8 @@ if TYPE_CHECKING:
 class Evaluate:
     """Measure a policy with a shield against a pursuer over random episodes, with 95 % bounds."""
 
-    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
-    """Run folder whose policy to evaluate, or goal-seeking for the untrained one."""
+    run: PolicyName = "goal-seeking"
+    """Run folder whose policy to evaluate, pretrained, or goal-seeking for the untrained one."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
@@ -131,6 +138,8 @@ def evaluation_table(evaluation: Evaluation) -> Any:
     median = figures["reach_time_median"]
     table.caption = (
         f"median time to reach {'-' if median is None else f'{median:.1f} s'}; "
+        f"mean {figures['time_mean']:.1f} s, where the others count {figures['time_limit']:g} s; "
+        f"straight there at full speed {figures['straight_time_mean']:.1f} s; "
         f"shield corrects {figures['intervention_rate']:.1%} of steps, cannot satisfy all rows in "
         f"{figures['infeasible_rate']:.2%}"
     )

@@ -13,13 +13,14 @@ from sidestep._program import command as command_line
 from sidestep.commands.common import (
     CountBar,
     Overrides,
+    PolicyOption,
     ShieldName,
     given,
     going_on,
     resume_words,
     say,
     scenario_from,
-    scenario_overrides,
+    scenario_of_run,
     settings_from,
     stood_still,
     unless_given,
@@ -39,8 +40,8 @@ class Falsify:
 
     shield: ShieldName = unless_given("joint")
     """Shield to attack."""
-    policy: Annotated[str, tyro.conf.arg(metavar="RUN|goal-seeking")] = unless_given("goal-seeking")
-    """Run folder whose policy steers the evader, or goal-seeking for the untrained one."""
+    policy: PolicyOption = unless_given("goal-seeking")
+    """Run folder whose policy steers the evader, pretrained, or goal-seeking for the untrained one."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder to write, never overwritten silently; runs/falsify-SHIELD by default."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
@@ -144,15 +145,11 @@ def _search(command: Falsify, out: Path, console: Console) -> Falsification:
 
 
 def _scenario(command: Falsify, stored: Any) -> Any:
-    """As `scenario_from`, but a new search without one takes that of the policy's run."""
-    from sidestep.store.runs import open_run
-    from sidestep.world import load_scenario
-
-    if stored is None and command.scenario is None and (Path(command.policy) / "config.json").is_file():
-        return load_scenario(
-            "paper", **{**open_run(command.policy)["scenario"], **scenario_overrides(command.set)}
-        )
-    return scenario_from(command, stored)
+    """As `scenario_from` for a search that is resumed, else as `scenario_of_run` of the policy."""
+    if stored is not None:
+        return scenario_from(command, stored)
+    run = None if command.policy == "goal-seeking" else command.policy
+    return scenario_of_run(run, command.scenario, command.set)[0]
 
 
 class SearchBar:

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Any, Literal
 
 from sidestep import _interrupts
 from sidestep._bounds import EPISODES, SEED, SPEED_UP, bounded
 from sidestep.commands.common import (
     CountBar,
     Overrides,
+    PolicyName,
     PursuerName,
     ScenarioName,
     ShieldName,
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
 class PhysicsCommand:
     """Options of a command that plays episodes in a physics simulator."""
 
-    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
-    """Run folder whose policy to use, or goal-seeking for the untrained one."""
+    run: PolicyName = "goal-seeking"
+    """Run folder whose policy to use, pretrained, or goal-seeking for the untrained one."""
     scenario: ScenarioName = "paper-test"
     """Preset or file."""
     shield: ShieldName = "joint"

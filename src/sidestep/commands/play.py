@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from sidestep._bounds import SEED, VISITORS, bounded
-from sidestep.commands.common import Overrides, PursuerName, ShieldName, policy_and_scenario
+from sidestep.commands.common import (
+    Overrides,
+    PolicyName,
+    PursuerName,
+    ShieldName,
+    given,
+    policy_and_scenario,
+    scenario_of_run,
+    unless_given,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,8 +30,9 @@ if TYPE_CHECKING:
 class Play:
     """Serve a page in which you drive the pursuer and try to capture the shielded robot."""
 
-    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|goal-seeking")] = "goal-seeking"
-    """Run folder whose policy drives the robot, or goal-seeking for the untrained one."""
+    run: PolicyName = unless_given("pretrained")
+    """Run folder whose policy drives the robot, pretrained, or goal-seeking for the untrained one. Where the
+    pretrained one does not fit the scenario, goal-seeking is the default."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     shield: ShieldName = "joint"
@@ -45,11 +55,24 @@ class Play:
     """Also open the page in the browser."""
 
 
+def _policy(command: Play) -> str:
+    """The policy that was asked for, or the default for the scenario."""
+    from sidestep.learning import PRETRAINED, PRETRAINED_SCENARIO
+    from sidestep.world import load_scenario, observation_names
+
+    if given(command, "run"):
+        return command.run
+    scenario, _ = scenario_of_run(PRETRAINED, command.scenario, command.set)
+    trained_for = load_scenario("paper", **PRETRAINED_SCENARIO)
+    fits = scenario.built_in and observation_names(scenario) == observation_names(trained_for)
+    return PRETRAINED if fits else "goal-seeking"
+
+
 def run(command: Play, console: Console) -> int:
     """Run `sidestep play` until Ctrl-C; returns the exit status."""
     from sidestep.views.play import Hosting, Limits, serve
 
-    policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
+    policy, scenario, _ = policy_and_scenario(_policy(command), command.scenario, command.set)
     hosting = Hosting(
         scenario,
         policy,

@@ -41,8 +41,8 @@ class Train:
     shield: ShieldName = unless_given("joint")
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = unless_given("nash")
-    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; mixed, one
-    after another; chauffeur for robots that cannot turn on the spot."""
+    """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; mixed,
+    one after another; chauffeur for robots that cannot turn on the spot."""
     episodes: int = bounded(unless_given(200), EPISODES)
     """Training episodes; with --resume the new total, if larger."""
     seed: int = bounded(unless_given(0), SEED)

@@ -3,12 +3,21 @@
 from sidestep.learning.divergence import Diverged
 from sidestep.learning.networks import Actor
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
-from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
+from sidestep.learning.policy import (
+    PRETRAINED,
+    PRETRAINED_SCENARIO,
+    LearnedPolicy,
+    load_policy,
+    policy_file,
+    write_policy,
+)
 from sidestep.learning.run import Progress, Training, resume_settings, train
 from sidestep.learning.td3 import TD3, Batch, Learner, update
 from sidestep.learning.training import decide_and_learn, run_chunk, start
 
 __all__ = [
+    "PRETRAINED",
+    "PRETRAINED_SCENARIO",
     "TD3",
     "Actor",
     "Batch",
@@ -22,6 +31,7 @@ __all__ = [
     "load_policy",
     "make_options",
     "options_to_dict",
+    "policy_file",
     "resume_settings",
     "run_chunk",
     "start",

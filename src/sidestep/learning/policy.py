@@ -15,6 +15,11 @@ from sidestep.store.checkpoints import read_arrays, read_named, write_arrays
 from sidestep.store.runs import RunError, open_run
 
 _FILE = "policy.npz"
+PRETRAINED = "pretrained"
+"""The name of the policy that comes with the package, for preset `paper` with `observation="motion"`."""
+_SHIPPED = Path(__file__).with_name("pretrained.npz")
+PRETRAINED_SCENARIO = {"observation": "motion"}
+"""The fields of preset `paper` that were changed for its training."""
 
 
 @final
@@ -30,7 +35,8 @@ class LearnedPolicy(eqx.Module):
         if observation.shape != (wanted,):
             raise ValueError(
                 f"this policy was trained on observations of {wanted} entries, this scenario has "
-                f"{observation.shape[-1]}: use the frame, pursuer_count and obstacle_count of its training"
+                f"{observation.shape[-1]}: use the frame, observation, pursuer_count and obstacle_count of "
+                "its training"
             )
         return self.actor(real(observation)[None])[0]
 
@@ -44,18 +50,31 @@ def write_policy(folder: str | Path, policy: LearnedPolicy) -> Path:
     return path
 
 
-def load_policy(run: str | Path) -> LearnedPolicy:
-    """Read the policy of a run folder, or of a `policy.npz` file.
+def policy_file(run: str | Path) -> Path:
+    """The file of a policy.
 
-    **Raises** `RunError` when the folder holds no run or its training has not ended, and `CheckpointError`
-    when the file is damaged.
+    **Arguments:** `run`, a run folder, a `policy.npz` file, or `"pretrained"` for the policy that comes with
+    the package; a folder of that name is `./pretrained`.
+
+    **Raises** `RunError` when the folder holds no run or its training has not ended.
     """
+    if run == PRETRAINED:
+        return _SHIPPED
     path = Path(run)
     if path.suffix != ".npz":
         open_run(path, otherwise="name a run folder, or the policy.npz in it")
         path = path / _FILE
         if not path.is_file():
             raise RunError(f"{run} has no policy yet: its training has not ended; continue it with --resume")
+    return path
+
+
+def load_policy(run: str | Path) -> LearnedPolicy:
+    """Read the policy of a run folder, of a `policy.npz` file, or `"pretrained"`; see `policy_file`.
+
+    **Raises** as `policy_file`, and `CheckpointError` when the file is damaged.
+    """
+    path = policy_file(run)
     _, manifest = read_named(path)
     observations, *hidden, actions = manifest["sizes"]
     example = Actor(observations, actions, tuple(hidden), jax.random.key(0))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, UInt
 
-from sidestep._arrays import Scalar, real, stack
+from sidestep._arrays import Lanes, Scalar, real, stack
 from sidestep.pursuit.pursuers import (
     Interceptor,
     Nash,
@@ -31,9 +31,9 @@ class Mixed(Pursuer):
     """One strategy after another, each at its own effort and agility, so that a policy cannot rely on one.
 
     For every stretch of `hold` seconds it draws a strategy of `strategies`; an effort, the share of the wheel
-    limits that it uses, from `least_effort` to 1 (half of the stretches at 1); and an agility, by which it
-    moves its wheel speeds towards those of the strategy in one control period, from `least_agility` to 1
-    (half of them at 1). Stretches begin at an offset of the episode's own.
+    limits that it uses, from `least_effort` to 1; and an agility, by which it moves its wheel speeds towards
+    those of the strategy in one control period, from `least_agility` to 1. A share `full` of the stretches
+    has effort 1, and one agility 1; by default all have. Stretches begin at an offset of the episode's own.
 
     A strategy keeps no state, so the draws are hash values of the target, which is constant in an episode,
     and of the stretch: episodes with equal targets get equal sequences. With one strategy, effort and agility
@@ -41,7 +41,8 @@ class Mixed(Pursuer):
     """
 
     strategies: tuple[Pursuer, ...] = eqx.field(default_factory=_strategies)
-    hold: Scalar = eqx.field(converter=real, default=8.0)
+    hold: Scalar = eqx.field(converter=real, default=20.0)
+    full: Scalar = eqx.field(converter=real, default=1.0)
     least_effort: Scalar = eqx.field(converter=real, default=0.5)
     least_agility: Scalar = eqx.field(converter=real, default=0.2)
 
@@ -61,8 +62,11 @@ class Mixed(Pursuer):
             seed = _hashed(seed + jnp.uint32(0x9E3779B9))
             drawn.append(_share(seed))
         number = jnp.floor(drawn[0] * len(self.strategies)).astype(jnp.int32)
-        effort = jnp.where(drawn[1] < 0.5, 1.0, self.least_effort + (1.0 - self.least_effort) * drawn[2])
-        agility = jnp.where(drawn[3] < 0.5, 1.0, self.least_agility + (1.0 - self.least_agility) * drawn[4])
+
+        def share(number: int, least: Scalar) -> Lanes:
+            return jnp.where(drawn[number] < self.full, 1.0, least + (1.0 - least) * drawn[number + 1])
+
+        effort, agility = share(1, self.least_effort), share(3, self.least_agility)
         wheels = jnp.zeros_like(world.pursuer[:2])
         for index, strategy in enumerate(self.strategies):
             chosen = number == index

@@ -59,6 +59,11 @@ def export_onnx(
     check_what(scenario, what, policy)
     if policy is not None:
         _check_policy(scenario, policy)
+    if what == "policy+filter" and scenario.observation == "motion":
+        raise ValueError(
+            "this policy observes the pursuers' motion (observation = 'motion'), and a graph's state of the "
+            "world has no wheel speeds: export the policy and the filter apart, or use the format jax"
+        )
     shield = GameShield(scenario) if shield is None else shield
     graph = Graph()
     if what == "policy":
@@ -89,7 +94,7 @@ def _check_policy(scenario: Scenario, policy: LearnedPolicy) -> None:
     if wanted != given:
         raise ValueError(
             f"this policy was trained on observations of {wanted} entries, this scenario has {given}: use "
-            "the frame, pursuer_count and obstacle_count of its training"
+            "the frame, observation, pursuer_count and obstacle_count of its training"
         )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sidestep._bounds import did_you_mean
-from sidestep.learning import load_policy, make_options, options_to_dict
+from sidestep.learning import PRETRAINED, load_policy, make_options, options_to_dict, policy_file
 from sidestep.loop.policies import GOAL_SEEKING
 from sidestep.pursuit import make_pursuer
 from sidestep.safety import make_shield
@@ -254,9 +254,9 @@ class _Reader:
         """The policy's identity and its file."""
         if label == GOAL_SEEKING:
             return label, None
-        path = (self.path.parent / label).absolute()
-        load_policy(path)
-        file = path if path.suffix == ".npz" else path / "policy.npz"
+        run = label if label == PRETRAINED else (self.path.parent / label).absolute()
+        load_policy(run)
+        file = policy_file(run)
         return digest_of_file(file), str(file)
 
     def check_policies(self, choices: Mapping[str, Mapping[Any, Any]]) -> None:
