@@ -19,8 +19,8 @@ def _times(shield, pursuer, episodes, **changes):
 
 
 def test_it_is_faster_than_driving_straight_behind_the_same_shield():
-    """Against the pursuer that costs a straight drive most. With the obstacle far off `game` does what `joint`
-    does."""
+    """Against the pursuer that costs a straight drive most; the obstacle is far off, so `game` does what
+    `joint` does."""
     learned, straight = _times("game", "interceptor", 128, obstacle_starts=[[100.0, 100.0]])
     assert learned < 0.75 * straight
 
