@@ -39,7 +39,7 @@ FILES = {
         "import sidestep\n"
         "from sidestep.safety.clearance import ClearanceGame, Resolution, clearance_table\n"
         "game = ClearanceGame.of(sidestep.load_scenario('paper', capture_distance=0.1))\n"
-        "few = Resolution(height=0.01, growth=1.5, share=0.1, bearings=4, angles=24, headings=12, turns=2)\n"
+        "few = Resolution(height=0.01, growth=1.5, share=0.1, bearings=4, angles=32, headings=12, turns=2)\n"
         "print(clearance_table(game, few, periods=5).farthest)\n"
     ),
     "step.py": (
