@@ -78,8 +78,8 @@ def twin_figure(
         obstacles.set_xlabel("time, s")
         obstacles.set_xlim(0.0, period * max(simulation.length, twin.length))
         titles += [
-            "Distance to the nearest pursuer; black: captured",
-            "Distance to the nearest obstacle; black: collided",
+            "Nearest pursuer; black: captured",
+            "Nearest obstacle; black: collided",
         ]
         style.panel_titles([upper, lower, pursuers, obstacles], titles)
         return style.save(figure, path)
@@ -98,7 +98,7 @@ def _scale(axes: Axes, least: float, name: str, trajectories: Iterable[Trajector
             ticks.append(tick)
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
-    axes.set_ylabel("m (log scale)")
+    axes.set_ylabel("distance, m")
 
 
 def _distances(trajectory: Trajectory, group: str) -> Float[np.ndarray, "t"]:
