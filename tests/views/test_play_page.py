@@ -98,6 +98,21 @@ def test_keys_drive_the_pursuer_and_pause_stops_the_world(page):
     assert page.evaluate("location.href") == before
 
 
+@pytest.mark.parametrize(
+    "page",
+    [{"viewport": {"width": width, "height": 760}} for width in (1280, 1440, 1920)],
+    ids=["laptop", "desktop", "projector"],
+    indirect=True,
+)
+def test_counters_of_an_hour_do_not_lie_under_the_verdict(page):
+    page.evaluate(
+        "() => { for (const id of ['score-survived', 'score-longest'])"
+        " document.getElementById(id).textContent = '3599.9\u202fs'; }"
+    )
+    edge = "() => document.getElementById('{}').getBoundingClientRect().{}"
+    assert page.evaluate(edge.format("verdict", "right")) <= page.evaluate(edge.format("score", "left"))
+
+
 def test_a_person_catches_the_robot_without_a_shield(page, address):
     page.goto(address + AHEAD)
     page.reload()

@@ -18,7 +18,7 @@ const CHANCES = {
 };
 const LEGEND = [
   ["evader", "robot"], ["pursuer", "pursuer, capture circle"], ["hull", "capture set K"], ["level", "level h"],
-  ["wish", "nominal velocity"], ["correction", "shield corrects"], ["plan", "way out"], ["target", "target"], ["obstacle", "obstacle"],
+  ["wish", "nominal velocity"], ["correction", "shield corrects"], ["plan", "escape plan"], ["target", "target"], ["obstacle", "obstacle"],
 ];
 const SHOWS = ["capture", "velocities", "rows", "plan", "trails"];
 
