@@ -10,6 +10,7 @@ can beat. The difference is that of each start, with a 95 % bootstrap interval. 
 """
 
 import argparse
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ def main() -> int:
     arguments = parser.parse_args()
     policy, scenario, _ = policy_and_scenario(arguments.run, None, tuple(arguments.set))
     steps = round(LIMIT / float(scenario.control_period))
-    policy, scenario, _ = policy_and_scenario(arguments.run, None, (*arguments.set, f"episode_steps={steps}"))
+    scenario = dataclasses.replace(scenario, episode_steps=steps)
     settings = {
         "run": arguments.run, "shield": arguments.shield, "episodes": arguments.episodes,
         "seed": arguments.seed, "set": arguments.set, "time_limit": LIMIT,

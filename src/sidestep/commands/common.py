@@ -136,12 +136,10 @@ def scenario_of_run(
     from sidestep.world import load_scenario
 
     changes = scenario_overrides(overrides)
-    if run == PRETRAINED:
-        return load_scenario(scenario or "paper", **{**PRETRAINED_SCENARIO, **changes}), {}
-    config = open_run(run) if run is not None and Path(run).is_dir() else {}
+    config = open_run(run) if run not in (None, PRETRAINED) and Path(run).is_dir() else {}
     if scenario is None and config:
         return load_scenario("paper", **{**config["scenario"], **changes}), config
-    stored = config.get("scenario", {})
+    stored = PRETRAINED_SCENARIO if run == PRETRAINED else config.get("scenario", {})
     seen = {name: stored[name] for name in ("frame", "observation") if name in stored}
     return load_scenario(scenario or "paper", **{**seen, **changes}), config
 

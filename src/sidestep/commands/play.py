@@ -16,7 +16,6 @@ from sidestep.commands.common import (
     ShieldName,
     given,
     policy_and_scenario,
-    scenario_of_run,
     unless_given,
 )
 
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rich.console import Console
+
+    from sidestep.world import Scenario
 
 
 @dataclass(frozen=True)
@@ -55,24 +56,24 @@ class Play:
     """Also open the page in the browser."""
 
 
-def _policy(command: Play) -> str:
-    """The policy that was asked for, or the default for the scenario."""
-    from sidestep.learning import PRETRAINED, PRETRAINED_SCENARIO
-    from sidestep.world import load_scenario, observation_names
+def _policy_and_scenario(command: Play) -> tuple[Any, Scenario]:
+    """What was asked for; without a policy's name goal-seeking where the pretrained one does not fit."""
+    from sidestep.learning import PRETRAINED_SCENARIO
+    from sidestep.world import Scenario, observation_names
 
-    if given(command, "run"):
-        return command.run
-    scenario, _ = scenario_of_run(PRETRAINED, command.scenario, command.set)
-    trained_for = load_scenario("paper", **PRETRAINED_SCENARIO)
+    policy, scenario, _ = policy_and_scenario(command.run, command.scenario, command.set)
+    trained_for = Scenario(observation=PRETRAINED_SCENARIO["observation"])
     fits = scenario.built_in and observation_names(scenario) == observation_names(trained_for)
-    return PRETRAINED if fits else "goal-seeking"
+    if not fits and not given(command, "run"):
+        policy, scenario, _ = policy_and_scenario("goal-seeking", command.scenario, command.set)
+    return policy, scenario
 
 
 def run(command: Play, console: Console) -> int:
     """Run `sidestep play` until Ctrl-C; returns the exit status."""
     from sidestep.views.play import Hosting, Limits, serve
 
-    policy, scenario, _ = policy_and_scenario(_policy(command), command.scenario, command.set)
+    policy, scenario = _policy_and_scenario(command)
     hosting = Hosting(
         scenario,
         policy,

@@ -30,15 +30,18 @@ class LearnedPolicy(eqx.Module):
     decision_steps: int = eqx.field(static=True)
 
     def __call__(self, observation: Float[AnyArray, "observation"]) -> Float[Array, "2"]:
-        """**Raises** `ValueError` if the observation's length differs from that of the training."""
+        """**Raises** as `check_shape`."""
+        self.check_shape(observation.shape)
+        return self.actor(real(observation)[None])[0]
+
+    def check_shape(self, shape: tuple[int, ...]) -> None:
+        """**Raises** `ValueError` unless the policy was trained on observations of this shape."""
         wanted = self.actor.body.weights[0].shape[0]
-        if observation.shape != (wanted,):
+        if shape != (wanted,):
             raise ValueError(
                 f"this policy was trained on observations of {wanted} entries, this scenario has "
-                f"{observation.shape[-1]}: use the frame, observation, pursuer_count and obstacle_count of "
-                "its training"
+                f"{shape[-1]}: use the frame, observation, pursuer_count and obstacle_count of its training"
             )
-        return self.actor(real(observation)[None])[0]
 
 
 def write_policy(folder: str | Path, policy: LearnedPolicy) -> Path:

@@ -58,7 +58,7 @@ def export_onnx(
     """
     check_what(scenario, what, policy)
     if policy is not None:
-        _check_policy(scenario, policy)
+        policy.check_shape((observation_size(scenario),))
     if what == "policy+filter" and scenario.observation == "motion":
         raise ValueError(
             "this policy observes the pursuers' motion (observation = 'motion'), and a graph's state of the "
@@ -87,15 +87,6 @@ def export_onnx(
         path, graph.model(what.replace("+", "_and_"), _TEXTS[what], as_text(about)), overwrite=overwrite
     )
     return about
-
-
-def _check_policy(scenario: Scenario, policy: LearnedPolicy) -> None:
-    wanted, given = policy.actor.body.weights[0].shape[0], observation_size(scenario)
-    if wanted != given:
-        raise ValueError(
-            f"this policy was trained on observations of {wanted} entries, this scenario has {given}: use "
-            "the frame, observation, pursuer_count and obstacle_count of its training"
-        )
 
 
 def _filtered(graph: Graph, shield: GameShield, policy: LearnedPolicy | None) -> None:
