@@ -4,6 +4,7 @@
     python benchmarks/many_episodes.py joint --out benchmarks/results/joint_episodes.json
     python benchmarks/many_episodes.py three-obstacles --out benchmarks/results/joint_three_obstacles.json
     python benchmarks/many_episodes.py joint --policies runs/reproduce/joint --pursuers nash --out FILE
+    python benchmarks/many_episodes.py attacked --out benchmarks/results/joint_attacked.json
 
 - `game`: captures behind the `game` shield without obstacles, a million episodes of 60 s. Two policies never
   finish, so that an episode ends in a capture or not at all: `stay` heads for the target and then holds
@@ -11,6 +12,7 @@
   that only the shield keeps it free. Starts are uniform in the scenario's square, outside the capture set.
 - `joint`: the shield `joint` with one obstacle and the untrained policy that heads for the target, or a run
   folder's; 20,000 episodes of at most 120 s against `nash`, 5,000 against every other pursuer.
+- `attacked`: the same, 10,000 episodes against each pursuer of `attack_pursuers`.
 - `three-obstacles`: the same with three obstacles, 5,000 episodes against `nash`.
 - `2-pursuers-game`, `2-pursuers-joint`, and so with 3: several `nash` at once, no obstacle, 500 each.
 
@@ -71,6 +73,7 @@ STUDIES = {
         other=10,
         blocks={"nash": 40},
     ),
+    "attacked": Study("joint", ("goal-seeking",), {"episode_steps": 2400}, block=500, batch=250, other=20),
     "three-obstacles": Study(
         "joint",
         ("goal-seeking",),
@@ -121,6 +124,7 @@ def _policy(name: str) -> Any:
 
 
 _policies: dict[str, Any] = {}
+_pursuers: dict[str, Any] = {}
 
 
 def run_block(job: tuple[str, str, str, int, int, int, dict[str, Any]]) -> dict[str, Any]:
@@ -129,6 +133,7 @@ def run_block(job: tuple[str, str, str, int, int, int, dict[str, Any]]) -> dict[
     import jax
     import numpy as np
 
+    from attack_pursuers import pursuer_named
     from sidestep.trials import evaluate
     from sidestep.world import load_scenario
 
@@ -139,7 +144,10 @@ def run_block(job: tuple[str, str, str, int, int, int, dict[str, Any]]) -> dict[
     begun = time.perf_counter()
     key = jax.random.fold_in(jax.random.key(seed), block)
     batch = episodes if jax.default_backend() != "cpu" else min(episodes, STUDIES[study].batch)
-    result = evaluate(scenario, _policies[policy], STUDIES[study].shield, pursuer, episodes, key, batch=batch)
+    if pursuer not in _pursuers:
+        _pursuers[pursuer] = pursuer_named(pursuer)
+    against = _pursuers[pursuer]
+    result = evaluate(scenario, _policies[policy], STUDIES[study].shield, against, episodes, key, batch=batch)
 
     def happened(outcome: str) -> list[int]:
         return [int(number) for number in result.numbers_of(outcome)]
@@ -229,6 +237,7 @@ def _write(path: Path, settings: dict[str, Any], blocks: list[dict[str, Any]]) -
 def main() -> None:
     import jax
 
+    from attack_pursuers import ATTACKS
     from sidestep.pursuit import PURSUERS
 
     parser = argparse.ArgumentParser(
@@ -236,7 +245,7 @@ def main() -> None:
     )
     parser.add_argument("study", choices=list(STUDIES))
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--pursuers", nargs="*", default=list(PURSUERS), choices=list(PURSUERS))
+    parser.add_argument("--pursuers", nargs="*", choices=[*PURSUERS, *ATTACKS], help="the study's by default")
     parser.add_argument("--policies", nargs="*", help="stay, reckless, goal-seeking or a run folder")
     parser.add_argument(
         "--blocks", type=int, help="blocks for each pursuer and policy; the study's by default"
@@ -248,6 +257,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     study = STUDIES[arguments.study]
+    pursuers = arguments.pursuers or list(ATTACKS if arguments.study == "attacked" else PURSUERS)
     changes = {name: json.loads(value) for name, value in (f.split("=", 1) for f in arguments.set)}
     fields = study.fields | changes
     size = arguments.block or study.block * (1 if jax.default_backend() == "cpu" else 29)
@@ -259,12 +269,12 @@ def main() -> None:
     done = {(b["pursuer"], b["policy"], b["block"]) for b in blocks}
     wanted = {
         pursuer: study.blocks.get(pursuer, study.other) if arguments.blocks is None else arguments.blocks
-        for pursuer in arguments.pursuers
+        for pursuer in pursuers
     }
     jobs = [
         (arguments.study, pursuer, policy, arguments.seed, block, size, fields)
         for block in range(max(wanted.values(), default=0))
-        for pursuer in arguments.pursuers
+        for pursuer in pursuers
         for policy in arguments.policies or study.policies
         if block < wanted[pursuer] and (pursuer, policy, block) not in done
     ]

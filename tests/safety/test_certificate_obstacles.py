@@ -74,9 +74,18 @@ def test_nothing_is_claimed_where_the_table_does_not_apply(options, why):
 
 
 def test_where_the_pursuer_alone_cannot_be_kept_away_the_reason_is_given():
-    certificate = certify(load_scenario("paper"), obstacles=True, check_shield=False)
+    scenario = load_scenario("paper", capture_distance=0.25)
+    certificate = certify(scenario, obstacles=True, check_shield=False)
     assert certificate.obstacles is None
-    assert "no design angle keeps the pursuer 0.2 m away" in said(certificate, "not claimed")
+    assert "no design angle keeps the pursuer 0.25 m away" in said(certificate, "not claimed")
+
+
+def test_where_the_pursuer_can_nearly_be_kept_away_it_is_said_for_how_long():
+    certificate = certify(load_scenario("paper"), obstacles=True, check_shield=False)
+    assert certificate.obstacles.seconds == pytest.approx(4.0)
+    assert "outside the capture set of 0.197884 m" in said(certificate, "computed")
+    assert "free of both for 4 s" in said(certificate, "computed")
+    assert "still can in 4 s" in said(certificate, "not claimed")
 
 
 def test_an_obstacle_without_a_start_is_refused():

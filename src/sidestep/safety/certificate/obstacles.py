@@ -51,6 +51,7 @@ class ObstacleClearance:
     - `drift` that the table is for; `fastest_drift` at which there still is one, on a coarse grid, or None
       where it was not asked for
     - `directions` see `Direction`
+    - `seconds` for which all that holds, None for ever
     - `start_height` h' of the asked start, `start_clearance` that an obstacle must have from it in the
       `start_worst` direction (rad); `obstacle_margin` of the asked obstacle; None where not asked
     """
@@ -61,6 +62,7 @@ class ObstacleClearance:
     drift: float
     fastest_drift: float | None
     directions: tuple[Direction, ...]
+    seconds: float | None = None
     start_height: float | None = None
     start_clearance: float | None = None
     start_worst: float | None = None
@@ -99,8 +101,9 @@ def obstacle_clearance(
         beyond=table.farthest,
         smallest_gap=table.smallest_gap,
         drift=drift,
-        fastest_drift=fastest_drift(game, drift, tell) if search_drift else None,
+        fastest_drift=fastest_drift(game, drift, tell) if search_drift and table.periods is None else None,
         directions=tuple(_direction(table, h, math.radians(b)) for b in BEARINGS for h in HEIGHTS),
+        seconds=None if table.periods is None else table.periods * game.control_period,
     )
     if start is None:
         return found

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep._bounds import within
-from sidestep.safety.sampled.sampled_design import COARSE, best_angle
+from sidestep.safety.sampled.sampled_design import COARSE, best_angle, largest_true
 from sidestep.safety.sampled.sampled_game import SampledGame
 from sidestep.world import Scenario
 
@@ -26,7 +26,8 @@ class ClearanceGame:
     `half_axle` b) must stay at least `capture_distance` l away, the obstacle, which drifts at up to
     `obstacle_speed` v_c in any direction, at least `collision_distance` d, and by `spare` more after each
     period. `angle` S' > S is the design angle of the set that the evader keeps from the pursuer; whether it
-    `can_stop`, or always drives at full speed.
+    `can_stop`, or always drives at full speed. `shortfall` (m) is how much more than `capture_distance` was
+    asked for, where nobody can keep that for ever.
     """
 
     evader_speed: float = field(metadata=within(above=0.0, most=1e3, unit="m/s"))
@@ -39,32 +40,40 @@ class ClearanceGame:
     spare: float = field(metadata=within(least=0.0, most=1.0, unit="m"))
     angle: float = field(metadata=within(above=0.0, below=math.pi / 2.0, unit="rad"))
     can_stop: bool = True
+    shortfall: float = field(default=0.0, metadata=within(least=0.0, most=1e3, unit="m"))
 
     @staticmethod
-    def of(scenario: Scenario, *, angle: float | None = None, spare: float = 0.0) -> ClearanceGame:
+    def of(
+        scenario: Scenario, *, angle: float | None = None, spare: float = 0.0, nearest: bool = False
+    ) -> ClearanceGame:
         """That of a scenario.
 
         **Arguments:** `angle` S' (rad), by default a quarter of the way from S to that with the most slack
         against the pursuer alone: a wider one shortens what is lost per period and lengthens the tip;
-        `spare` (m), how much more an obstacle must be away after a period than the table says.
+        `spare` (m), how much more an obstacle must be away after a period than the table says; `nearest`:
+        where the evader cannot keep the capture distance for ever at this period, but nearly, that of a
+        capture distance that it can keep, see `shortfall`.
 
         **Raises** `ValueError` where no angle lets the evader keep the capture distance at this period.
         """
         scenario.check_built_in("a clearance table", "there is none for other robots")
+        wanted = float(scenario.capture_distance)
+        level = wanted if angle is not None or not nearest else _kept(scenario)
         if angle is None:
-            angle = _best_angle(scenario)
+            angle = _best_angle(scenario, level)
         drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
         return ClearanceGame(
             evader_speed=float(scenario.evader_speed),
             pursuer_speed=float(scenario.pursuer_speed),
             half_axle=float(scenario.pursuer_half_axle),
-            capture_distance=float(scenario.capture_distance),
+            capture_distance=level,
             collision_distance=float(scenario.collision_distance),
             obstacle_speed=drift,
             control_period=float(scenario.control_period),
             spare=spare,
             angle=angle,
             can_stop=scenario.action == "velocity",
+            shortfall=wanted - level,
         )
 
     def refuses(self, scenario: Scenario) -> str:
@@ -73,11 +82,12 @@ class ClearanceGame:
         if not scenario.built_in:
             return "it has robots of its own"
         drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
+        level = max(float(scenario.capture_distance) - self.shortfall, 0.0)
         compared = (
             ("evader_speed", float(scenario.evader_speed), -1),
             ("pursuer_speed", float(scenario.pursuer_speed), 0),
             ("half_axle", float(scenario.pursuer_half_axle), 0),
-            ("capture_distance", float(scenario.capture_distance), 1),
+            ("capture_distance", level, 1),
             ("collision_distance", float(scenario.collision_distance), 1),
             ("obstacle_speed", drift, 1),
             ("control_period", float(scenario.control_period), 0),
@@ -123,14 +133,35 @@ class ClearanceGame:
         return np.unique(np.concatenate([np.stack(poses), heading], -1).reshape(-1, 3).round(15), axis=0)
 
 
-def _best_angle(scenario: Scenario) -> float:
-    game = SampledGame(
+_NEARLY = 0.95
+"""Share of the capture distance that an evader must be able to keep to keep it nearly."""
+_BELOW = 0.998
+"""Share of the largest distance that it can keep: the design angle then has some slack."""
+
+
+def _sampled(scenario: Scenario) -> SampledGame:
+    return SampledGame(
         float(scenario.evader_speed),
         float(scenario.pursuer_speed),
         float(scenario.pursuer_half_axle),
         float(scenario.control_period),
     )
-    level = float(scenario.capture_distance)
+
+
+def _kept(scenario: Scenario) -> float:
+    """The capture distance (m), or the largest that the evader can keep for ever if that is nearly as
+    much."""
+    game, wanted = _sampled(scenario), float(scenario.capture_distance)
+    if best_angle(game, wanted, COARSE)[1] >= 0.0:
+        return wanted
+    level = _BELOW * largest_true(
+        lambda level: best_angle(game, level, COARSE)[1], _NEARLY * wanted, wanted, 1e-4 * wanted
+    )
+    return level if best_angle(game, level, COARSE)[1] >= 0.0 else wanted
+
+
+def _best_angle(scenario: Scenario, level: float) -> float:
+    game = _sampled(scenario)
     widest, slack = best_angle(game, level, COARSE)
     if not slack >= 0.0:
         raise ValueError(

@@ -19,6 +19,8 @@ from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Place, Spacing
 from sidestep.safety.sampled.flow_map import seen_from
 
+MOST = 1.3
+"""The largest clearance (m) that a table can hold."""
 _BLOCK = 64
 """Nodes whose transitions are computed at once."""
 _EVEN = 1e3
@@ -75,7 +77,8 @@ class Resolution:
         return Angles(low, self.angles)
 
 
-_ROUGH = Resolution(height=0.002, growth=1.3, share=0.01, share_growth=1.4, bearings=12, angles=96)
+ROUGH = Resolution(height=0.002, growth=1.3, share=0.01, share_growth=1.4, bearings=12, angles=96)
+"""For first solutions, and for tables of a few seconds."""
 STAGES = ("finding the ridge", "aligning", "solving")
 """What a solution goes through: coarsely, with rows aligned by the coarse ridge, and by the fine one."""
 
@@ -322,13 +325,18 @@ def solve(
     velocity keeps the pursuit barrier: the design angle does not suit the capture distance and the period.
     """
     resolution = Resolution() if resolution is None else resolution
+    if not game.collision_distance <= most <= MOST:
+        raise ValueError(
+            f"most = {most:g} m: it must lie between the collision distance and {MOST:g} m, which is the "
+            "largest clearance that a table can hold"
+        )
     check(game, title="clearance game: ")
     check(resolution, title="resolution: ")
     if resolution.angles % 2:
         raise ValueError(f"resolution: angles = {resolution.angles}: it must be even")
     needed("numba", "clearance", "solving for a clearance table needs", ValueError)
-    solution = _start(game, _ROUGH.grid(game), _ROUGH.directions(even=True)) if begun is None else begun
-    for stage, (how, least) in enumerate(((_ROUGH, 1e-4), (resolution, 1e-4), (resolution, tolerance))):
+    solution = _start(game, ROUGH.grid(game), ROUGH.directions(even=True)) if begun is None else begun
+    for stage, (how, least) in enumerate(((ROUGH, 1e-4), (resolution, 1e-4), (resolution, tolerance))):
         if stage < solution.stage:
             continue
         if stage > solution.stage:

@@ -24,7 +24,7 @@ from sidestep._arrays import AnyArray, Scalar
 from sidestep._compiled import cache_folder
 from sidestep.safety.clearance.game import SPARE, ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Spacing
-from sidestep.safety.clearance.solve import STAGES, Resolution, Solution, solve
+from sidestep.safety.clearance.solve import ROUGH, STAGES, Resolution, Solution, solve
 from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
 from sidestep.world.scenario import Scenario
@@ -34,6 +34,8 @@ STEP = 2e-5
 """Unit (m) in which tables are kept: clearances are rounded up to it."""
 _FOLDER = Path(__file__).with_name("tables")
 _SAVE_SECONDS = 20.0
+SHORT = 4.0
+"""Time (s) that a table is for where none can be for ever."""
 
 
 class ClearanceTable(eqx.Module):
@@ -42,17 +44,18 @@ class ClearanceTable(eqx.Module):
     With z the evader in the pursuer's frame, beta its angle to the pursuer's axis, and p from the obstacle to
     the evader in the same frame, the evader can stay free where
 
-        h'(z) >= 0  and  |p| >= R(z, direction of p),     h'(z) = |z| cos((S' - beta)+) - l.
+        h'(z) >= 0  and  |p| >= R(z, direction of p),     h'(z) = |z| cos((S' - beta)+) - l,
 
-    The table is the fixed point of the game in which the evader holds each velocity for a period, solved on a
-    grid: it is computed, not proved (see `docs/theory.md`). R is interpolated between the nodes, never across
-    the surfaces at which the evader loses the choice of a side. R', `after` the evader's move and before the
-    pursuer's, is what then keeps R at the end of the period, whatever the pursuer does and however an
-    obstacle of the game's speed drifts in it.
+    for ever, or for `periods`. The table is the fixed point of the game in which the evader holds each
+    velocity for a period, or so many steps towards it, solved on a grid: it is computed, not proved (see
+    `docs/theory.md`). R is interpolated between the nodes, never across the surfaces at which the evader
+    loses the choice of a side. R', `after` the evader's move and before the pursuer's, is what then keeps R
+    at the end of the period, whatever the pursuer does and however an obstacle of the game's speed drifts in
+    it.
 
     **Attributes:** `clearance`, `after` (nodes, angles) in units of `STEP`; `ridge` (nodes,) rad, from which
     the angles of a row count; `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed
-    point, `change` the largest in the last of them, m.
+    point, `change` the largest in the last of them, m; `periods` that the evader stays free, None for ever.
     """
 
     clearance: UInt16[Array, "n k"]
@@ -63,10 +66,11 @@ class ClearanceTable(eqx.Module):
     directions: Angles = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
     change: float = eqx.field(static=True)
+    periods: int | None = eqx.field(static=True, default=None)
 
     @staticmethod
-    def of(game: ClearanceGame, solution: Solution) -> ClearanceTable:
-        """The table of a solution."""
+    def of(game: ClearanceGame, solution: Solution, periods: int | None = None) -> ClearanceTable:
+        """The table of a solution, and of the `periods` that it was solved for."""
         return ClearanceTable(
             _counted(solution.clearance),
             _counted(solution.after),
@@ -76,6 +80,7 @@ class ClearanceTable(eqx.Module):
             solution.directions,
             solution.sweeps,
             solution.change,
+            periods,
         )
 
     def __call__(self, z: Float[AnyArray, "2"], offset: Float[AnyArray, "2"]) -> tuple[Scalar, Scalar]:
@@ -158,14 +163,14 @@ class ClearanceTable(eqx.Module):
 
     def save(self, path: str | Path) -> None:
         """Write the table to a file. **Raises** `OutputError` where that cannot be written."""
-        _write(path, self, game=self.game.as_dict)
+        _write(path, self, game=self.game.as_dict, periods=self.periods)
 
     @staticmethod
     def load(path: str | Path) -> ClearanceTable:
         """The table of a file. **Raises** `ValueError` where there is none that this version reads."""
         try:
             solution, about = _read(path)
-            return ClearanceTable.of(ClearanceGame(**about["game"]), solution)
+            return ClearanceTable.of(ClearanceGame(**about["game"]), solution, about.get("periods"))
         except (OSError, ValueError, KeyError, TypeError, CheckpointError) as error:
             raise ValueError(f"{path} is no clearance table of this version of sidestep ({error})") from None
 
@@ -190,7 +195,7 @@ def clearance_table(
     folder = cache_folder()
     kept = None if folder is None else folder / "clearance" / f"{key}.npz"
     if kept is None:
-        return ClearanceTable.of(game, solve(game, resolution, periods=periods, progress=progress))
+        return ClearanceTable.of(game, solve(game, resolution, periods=periods, progress=progress), periods)
     if kept.exists():
         with suppress(ValueError):
             return ClearanceTable.load(kept)
@@ -216,28 +221,32 @@ def clearance_table(
         if latest is not None:
             _write(on_the_way, latest, stage=latest.stage)
         raise
-    table = ClearanceTable.of(game, solution)
+    table = ClearanceTable.of(game, solution, periods)
     table.save(kept)
     on_the_way.unlink(missing_ok=True)
     return table
 
 
 def table_for(scenario: Scenario, *, progress: Callable[[Solution], None] | None = None) -> ClearanceTable:
-    """The table that comes with sidestep for a scenario, or else the one of `clearance_table`.
+    """The table that comes with sidestep for a scenario, or else the one of `clearance_table`: for ever, or
+    for `SHORT` s where the evader can keep only nearly the capture distance for ever.
 
     **Raises** `ValueError` where there is none, saying why.
     """
     shipped = shipped_table(scenario)
     if shipped is not None:
         return shipped
-    return clearance_table(ClearanceGame.of(scenario, spare=SPARE), progress=progress)
+    game = ClearanceGame.of(scenario, spare=SPARE, nearest=True)
+    if not game.shortfall:
+        return clearance_table(game, progress=progress)
+    return clearance_table(game, ROUGH, periods=max(round(SHORT / game.control_period), 1), progress=progress)
 
 
 def shipped_table(scenario: Scenario) -> ClearanceTable | None:
     """The table that comes with sidestep and serves a scenario (see `ClearanceGame.refuses`), if any: of
-    several the one with the least clearance."""
+    several one for ever, and that with the least clearance."""
     serving = [table for table in _shipped() if not table.game.refuses(scenario)]
-    return min(serving, key=lambda table: table.farthest, default=None)
+    return min(serving, key=lambda table: (table.periods is not None, table.farthest), default=None)
 
 
 @functools.cache

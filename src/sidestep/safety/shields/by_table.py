@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any, final
 
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, traced
 from sidestep.safety.barriers.barrier import BarrierRows
+from sidestep.safety.barriers.budget import Budget
 from sidestep.safety.barriers.sampling_margin import with_margins
 from sidestep.safety.clearance.table import ClearanceTable
 from sidestep.safety.filter.projection import project
@@ -20,7 +22,8 @@ from sidestep.safety.filter.status import Status
 from sidestep.safety.shields.answer import correction, known_parts
 from sidestep.safety.shields.game import GameShield
 from sidestep.safety.shields.going_round import next_turn, still_turned, turned
-from sidestep.safety.shields.joint import JointShield
+from sidestep.safety.shields.joint import JointShield, real_or_none
+from sidestep.safety.shields.look_ahead import ramp
 from sidestep.safety.shields.masked_cond import masked_cond
 from sidestep.safety.shields.shield import Shield, ShieldResult
 from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
@@ -36,11 +39,10 @@ _BACK = 8
 
 class TableMemory(eqx.Module):
     """What the shield keeps from call to call: the `turn ()` that leads it round an obstacle, see
-    `going_round`, and the `JointMemory` of the look-ahead where it is `crowded`, None for a shield without
-    one."""
+    `going_round`, and the memory of the shield that decides `otherwise`, None without one."""
 
     turn: Scalar
-    crowded: Any
+    otherwise: Any
 
 
 class _Margins(eqx.Module):
@@ -51,30 +53,39 @@ class _Margins(eqx.Module):
     known: Bool[Array, "n"]
 
     @property
-    def least(self) -> Scalar:
-        both = jnp.concatenate([self.towards_pursuers, self.towards_obstacles])
-        return jnp.min(both, initial=jnp.inf, where=self.known)
+    def least(self) -> Float[Array, "2"]:
+        """The least one towards a pursuer, and towards an obstacle."""
+        m = len(self.towards_pursuers)
+        pursuers = jnp.min(self.towards_pursuers, initial=jnp.inf, where=self.known[:m])
+        return jnp.stack([pursuers, jnp.min(self.towards_obstacles, initial=jnp.inf, where=self.known[m:])])
 
 
 @final
 class TableShield(Shield):
     """Keeps the evader where the table says that it can stay free of every pursuer and obstacle.
 
-    **Decision.** With the margin m, the least of
-
-        h'(z) - `spare_pursuer`  and  |p| - R(z, p) - `spare_obstacle`
-
-    over all pursuers and pairs, it takes the velocity nearest to the nominal one after which m is, whatever
-    the pursuers and obstacles do in the period, at least (1 - `gain` T) m. If there is none, it takes the
-    nearest with m >= 0 (to change the side of a pursuer's axis spends h'), and if there is none of these,
-    that with the largest m: its status is then `INFEASIBLE`. It chooses among 48 headings at full and at half
-    speed and a stop, then goes back towards the nominal velocity as far as it may.
+    **Decision.** There are two margins, m. Towards pursuers it is the least h'(z) - `spare_pursuer`, towards
+    obstacles the least |p| - R(z, p) - `spare_obstacle` over all pairs of pursuer and obstacle. With m the
+    smaller one, the shield takes the velocity nearest to the nominal one after which both are, whatever the
+    pursuers and obstacles do in the period, at least (1 - `gain` T) m. If there is none, it takes the nearest
+    with both >= 0 (to change the side of a pursuer's axis spends h'). If there is none of these, pursuers go
+    first: of the velocities that keep h', or else of those that lose least of it, it takes the one with the
+    largest margin towards obstacles, and the status is `INFEASIBLE`. It chooses among 48 headings at full and
+    at half speed and a stop, then goes back towards the nominal velocity as far as it may.
 
     **What holds.** For one pursuer and one obstacle what the table promises (see `ClearanceTable`): it is
-    computed, not proved. Several are kept by the worst of all pairs, which promises as much while no two
-    matter at once. Where a second one is near, `crowded` decides if there is one: a look-ahead, which
-    `make_shield` adds for several obstacles or pursuers. An evader that is stuck behind an obstacle goes
-    round it, see `going_round`.
+    computed, not proved. A table for so many `periods` promises that much from each state of its set, not
+    that the evader stays in it. Several obstacles or pursuers are kept by the worst of all pairs, which
+    promises as much while no two matter at once. An evader that is stuck behind an obstacle goes round it,
+    see `going_round`.
+
+    **Otherwise.** Where no velocity keeps both margins, and where a second obstacle or pursuer is within
+    `near` (m) of contact, the shield `otherwise` decides if there is one. `make_shield` gives a look-ahead
+    for several obstacles or pursuers, and for tables that are not for ever.
+
+    **Arguments:** `budget` is kept beside what is to spare, and a tracking error e costs e T more in every
+    period; `acceleration` m/s^2: in the period the evader changes its velocity, `world.evader_velocity`, no
+    faster.
 
     The barriers reported are h' and |p| - R, m. The action carries the derivative of the nominal one where
     that is accepted, else none; `rows_only` is the shield to learn through.
@@ -82,12 +93,16 @@ class TableShield(Shield):
     **Raises** `ValueError` for a table of another game.
     """
 
+    keeps_pursuit_barrier = True
     scenario: Scenario
     table: ClearanceTable
     gain: Scalar = eqx.field(converter=real, default=4.0)
-    spare_pursuer: Scalar = eqx.field(converter=real, default=0.0005)
+    spare_pursuer: Scalar = eqx.field(converter=real, default=0.001)
     spare_obstacle: Scalar = eqx.field(converter=real, default=0.002)
-    crowded: JointShield | None = None
+    budget: Budget | None = None
+    acceleration: Scalar | None = eqx.field(converter=real_or_none, default=None)
+    near: Scalar = eqx.field(converter=real, default=0.8)
+    otherwise: TableShield | JointShield | None = None
 
     def __check_init__(self) -> None:
         if not traced(self.scenario) and (why := self.table.game.refuses(self.scenario)):
@@ -95,16 +110,16 @@ class TableShield(Shield):
 
     @property
     def rows_only(self) -> GameShield:
-        return GameShield(self.scenario, nominal_picks_side=True)
+        return GameShield(self.scenario, self.budget, nominal_picks_side=True)
 
     @property
     def looks_ahead(self) -> bool:
-        return self.crowded is not None
+        return self.otherwise is not None and self.otherwise.looks_ahead
 
     def plan(self, world: World, memory: TableMemory) -> Float[Array, "n 2"]:
-        return (
-            super().plan(world, memory) if self.crowded is None else self.crowded.plan(world, memory.crowded)
-        )
+        if self.otherwise is None:
+            return super().plan(world, memory)
+        return self.otherwise.plan(world, memory.otherwise)
 
     def filter_by_rows(
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
@@ -112,15 +127,15 @@ class TableShield(Shield):
         return self._by_table(world, jnp.asarray(nominal, world.evader.dtype), memory)
 
     def init(self, world: World) -> TableMemory:
-        crowded = None if self.crowded is None else self.crowded.init(world)
-        return TableMemory(jnp.zeros_like(world.time), crowded)
+        otherwise = None if self.otherwise is None else self.otherwise.init(world)
+        return TableMemory(jnp.zeros_like(world.time), otherwise)
 
     def has_plan(self, memory: TableMemory) -> Flag:
-        return jnp.zeros((), bool) if self.crowded is None else self.crowded.has_plan(memory.crowded)
+        return jnp.zeros((), bool) if self.otherwise is None else self.otherwise.has_plan(memory.otherwise)
 
     def margin(self, world: World) -> Scalar:
         """The margin m (m) now: at least 0 where the evader can stay free of every pursuer and obstacle."""
-        return self._margins(world).least
+        return jnp.min(self._margins(world).least)
 
     def rows(self, world: World, memory: Any) -> BarrierRows:
         game = self.rows_only
@@ -130,43 +145,42 @@ class TableShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
         nominal = jnp.asarray(nominal, world.evader.dtype)
-        if self.crowded is None:
-            return self._by_table(world, nominal, memory)
-        arrays, fixed = eqx.partition(self.crowded, eqx.is_array)
         answer = self._by_table(world, nominal, memory)
-        # The look-ahead begins anew in every crowd.
-        waiting = eqx.tree_at(lambda part: part[1].crowded, answer, self.crowded.init(world))
+        if self.otherwise is None:
+            return answer
+        arrays, fixed = eqx.partition(self.otherwise, eqx.is_array)
+        # It begins anew each time.
+        waiting = eqx.tree_at(lambda part: part[1].otherwise, answer, self.otherwise.init(world))
 
-        def look(arrays: Any, world: World, nominal: Float[Array, "2"], memory: TableMemory) -> Any:
-            result, after = eqx.combine(arrays, fixed)(world, nominal, memory.crowded)
+        def ask(arrays: Any, world: World, nominal: Float[Array, "2"], memory: TableMemory) -> Any:
+            result, after = eqx.combine(arrays, fixed)(world, nominal, memory.otherwise)
             return result, TableMemory(jnp.zeros_like(memory.turn), after)
 
         inputs = jax.lax.stop_gradient((arrays, world, nominal, memory))
-        crowd = self._is_crowded(world) & (answer[0].status != Status.INVALID)
-        result, after = masked_cond(look, crowd, jax.lax.stop_gradient(waiting), *inputs, width=4)
-        action = jnp.where(crowd, result.action, answer[0].action)
+        gives_up = self._is_crowded(world) | (answer[0].status == Status.INFEASIBLE)
+        gives_up &= answer[0].status != Status.INVALID
+        result, after = masked_cond(ask, gives_up, jax.lax.stop_gradient(waiting), *inputs, width=4)
+        action = jnp.where(gives_up, result.action, answer[0].action)
         return eqx.tree_at(lambda result: result.action, result, action), after
 
     def _is_crowded(self, world: World) -> Flag:
-        """Whether a second obstacle or pursuer is as near as those that the look-ahead minds."""
-        assert self.crowded is not None
-        near = self.crowded.near_obstacle
+        """Whether a second obstacle or pursuer is near."""
         gaps = norm(world.obstacles[:, :2] - world.evader) - self.scenario.collision_distance
         others = norm(world.pursuers[:, :2] - world.evader) - self.scenario.capture_distance
-        return (jnp.sum(gaps < near) > 1) | (jnp.sum(others < near) > 1)
+        return (jnp.sum(gaps < self.near) > 1) | (jnp.sum(others < self.near) > 1)
 
     def _by_table(
         self, world: World, nominal: Float[Array, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
         if not self.scenario.obstacle_count:
             return self._filtered(world, nominal, nominal), memory
-        kept = with_margins(self.scenario, None)
+        kept = with_margins(self.scenario, self.budget)
         turn = still_turned(kept, world, nominal, memory.turn)
         result = self._filtered(world, turned(nominal, turn), nominal)
         towards_pursuers = result.barriers[: self.scenario.pursuer_count]
         turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
         turn = jnp.where(result.status == Status.INVALID, 0.0, turn)
-        return result, TableMemory(turn.astype(memory.turn.dtype), memory.crowded)
+        return result, TableMemory(turn.astype(memory.turn.dtype), memory.otherwise)
 
     def _filtered(self, world: World, wanted: Float[Array, "2"], nominal: Float[Array, "2"]) -> ShieldResult:
         """The answer to `nominal`, in place of which `wanted` is tried."""
@@ -184,12 +198,16 @@ class TableShield(Shield):
         first = limited.action
         arrays, fixed = eqx.partition(self, eqx.is_array)
         now = self._margins(world)
-        least = now.least
-        aim = jnp.where(least > 0.0, (1.0 - self.gain * scenario.control_period) * least, least)
+        least = jnp.min(now.least)
+        aim = jnp.where(
+            least > 0.0,
+            (1.0 - self.gain * scenario.control_period) * least,
+            jnp.minimum(now.least, 0.0),
+        )
         margin = self._margin_after(world, first)
-        accepted = margin >= aim
+        accepted = jnp.all(margin >= aim)
 
-        def choose(arrays: Any, world: World, first: Float[Array, "2"], aim: Scalar) -> Any:
+        def choose(arrays: Any, world: World, first: Float[Array, "2"], aim: Float[Array, "2"]) -> Any:
             return eqx.combine(arrays, fixed)._choose(world, first, aim)
 
         start = jax.lax.stop_gradient((first, margin))
@@ -197,19 +215,23 @@ class TableShield(Shield):
         action, margin = masked_cond(choose, ~accepted, start, *inputs, width=8)
         action = jnp.where(accepted, first, action)
         same = accepted & (limited.status == Status.OK) & jnp.all(wanted == nominal)
-        status = jnp.where(margin >= 0.0, jnp.where(same, Status.OK, Status.CORRECTED), Status.INFEASIBLE)
+        status = jnp.where(
+            jnp.all(margin >= 0.0), jnp.where(same, Status.OK, Status.CORRECTED), Status.INFEASIBLE
+        )
         status = jnp.where(everything & finite, status, Status.INVALID)
         barriers = jnp.concatenate([now.towards_pursuers, now.towards_obstacles])
         return ShieldResult(
             action=action,
             status=status.astype(limited.status.dtype),
             barriers=jnp.where(known, barriers, -jnp.inf),
-            slack=(margin - aim) / scenario.control_period,
+            slack=jnp.min(margin - aim) / scenario.control_period,
             intervention=correction(action, jnp.where(finite, nominal, 0.0)),
         )
 
-    def _choose(self, world: World, first: Float[Array, "2"], aim: Scalar) -> tuple[Array, Scalar]:
-        """The velocity (m/s) in place of `first`, and the margin (m) after it."""
+    def _choose(
+        self, world: World, first: Float[Array, "2"], aim: Float[Array, "2"]
+    ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        """The velocity (m/s) in place of `first`, and the margins (m) after it."""
         speed, circle = self.scenario.evader_speed, self.scenario.action == "heading"
         heading = 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS
         full = speed * jnp.asarray(np.stack([np.cos(heading), np.sin(heading)], -1), first.dtype)
@@ -219,10 +241,17 @@ class TableShield(Shield):
         full = jnp.concatenate([full, *tips])
         options = full if circle else jnp.concatenate([full, 0.5 * full, jnp.zeros((1, 2), first.dtype)])
         after = jax.vmap(lambda option: self._margin_after(world, option))(options)
-        aim = jnp.where(jnp.any(after >= aim), aim, 0.0)
+        kept = jnp.all(after >= aim, axis=-1)
+        aim = jnp.where(jnp.any(kept), aim, 0.0)
+        kept = jnp.all(after >= aim, axis=-1)
+        # Pursuers first: of those that keep away from them, or else come nearest to it, the best one towards
+        # obstacles.
+        free = after[:, 0] >= jnp.minimum(jnp.max(after[:, 0]), 0.0)
         change = norm(options - first)
         best = jnp.where(
-            jnp.any(after >= aim), jnp.argmin(jnp.where(after >= aim, change, jnp.inf)), jnp.argmax(after)
+            jnp.any(kept),
+            jnp.argmin(jnp.where(kept, change, jnp.inf)),
+            jnp.argmax(jnp.where(free, after[:, 1], -jnp.inf)),
         )
         # Back towards the nominal velocity, as far as one step after the other still keeps the aim.
         share = jnp.arange(1, _BACK).astype(first.dtype)[:, None] / _BACK
@@ -230,7 +259,7 @@ class TableShield(Shield):
         if circle:
             back = back * (speed / jnp.maximum(norm(back), 1e-6 * speed))[:, None]
         back_after = jax.vmap(lambda option: self._margin_after(world, option))(back)
-        steps = jnp.sum(jnp.cumprod((back_after >= aim).astype(jnp.int32)))
+        steps = jnp.sum(jnp.cumprod(jnp.all(back_after >= aim, axis=-1).astype(jnp.int32)))
         moved = jnp.maximum(steps - 1, 0)
         return (
             jnp.where(steps > 0, back[moved], options[best]),
@@ -247,31 +276,35 @@ class TableShield(Shield):
         """h' less what is to spare towards each pursuer, and for each obstacle the least |p| - R, less the
         same, over all pursuers."""
         towards_obstacles = self._alone(world, jnp.zeros_like(world.evader))
+        to_pursuers, to_obstacles = self._spares
         heights = []
         for pose in world.pursuers:
             z = to_pursuer_frame(world.evader, pose)
-            heights.append(self.table.grid.height(jnp, z[0], z[1]) - self.spare_pursuer)
+            heights.append(self.table.grid.height(jnp, z[0], z[1]) - to_pursuers)
             gaps = [
-                norm(p) - self.table(z, to_pursuer_axes(p, pose[2]))[1] - self.spare_obstacle
+                norm(p) - self.table(z, to_pursuer_axes(p, pose[2]))[1] - to_obstacles
                 for p in world.evader - world.obstacles[:, :2]
             ]
             towards_obstacles = _at_most(towards_obstacles, gaps)
         return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world))
 
-    def _margin_after(self, world: World, action: Float[Array, "2"]) -> Scalar:
-        """The margin (m) a period after `action` (m/s), whatever pursuers and obstacles do."""
+    def _margin_after(self, world: World, action: Float[Array, "2"]) -> Float[Array, "2"]:
+        """The margins (m) a period after `action` (m/s), whatever pursuers and obstacles do."""
         period = self.scenario.control_period
+        if self.acceleration is not None:
+            action, _ = ramp(world.evader_velocity, action, self.acceleration, period)
         move, drift = period * action, period * self._drift
         towards_obstacles = self._alone(world, move) - drift
+        to_pursuers, to_obstacles = self._spares
         heights = []
         motions = jnp.asarray(self.table.game.motions(_TURNS, 2), move.dtype)
         for pose in world.pursuers:
             z, moved = to_pursuer_frame(world.evader, pose), to_pursuer_axes(move, pose[2])
             there = jnp.broadcast_to((z + moved)[:, None], (2, len(motions)))
             seen = to_pursuer_frame(there, motions.T)
-            heights.append(jnp.min(self.table.grid.height(jnp, seen[0], seen[1])) - self.spare_pursuer)
+            heights.append(jnp.min(self.table.grid.height(jnp, seen[0], seen[1])) - to_pursuers)
             gaps = [
-                self.table.spare_after(z, to_pursuer_axes(p, pose[2]), moved, drift) - self.spare_obstacle
+                self.table.spare_after(z, to_pursuer_axes(p, pose[2]), moved, drift) - to_obstacles
                 for p in world.evader - world.obstacles[:, :2]
             ]
             towards_obstacles = _at_most(towards_obstacles, gaps)
@@ -282,8 +315,26 @@ class TableShield(Shield):
         return (
             norm(world.evader + move - world.obstacles[:, :2])
             - self.scenario.collision_distance
-            - self.spare_obstacle
+            - self._spares[1]
         )
+
+    @property
+    def _spares(self) -> tuple[Scalar, Scalar]:
+        """What is to spare (m) towards pursuers, beyond the distance of the table, and towards obstacles."""
+        scenario, budget = self.scenario, self.budget
+        more = jnp.maximum(scenario.capture_distance - self.table.game.capture_distance, 0.0)
+        pursuers, obstacles = self.spare_pursuer + more, self.spare_obstacle
+        if budget is None:
+            return pursuers, obstacles
+        off = budget.tracking_error * scenario.control_period
+        return (
+            pursuers + budget.towards_pursuers(scenario) + off,
+            obstacles + budget.towards_obstacles(scenario) + off,
+        )
+
+    def with_acceleration(self, acceleration: float) -> TableShield:
+        otherwise = None if self.otherwise is None else self.otherwise.with_acceleration(acceleration)
+        return dataclasses.replace(self, acceleration=acceleration, otherwise=otherwise)
 
     @property
     def _drift(self) -> Scalar:

@@ -78,11 +78,12 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     if name == "joint" and budget is None and not traced(scenario):
         table = shipped_table(scenario)
         if table is not None:
-            # Where two obstacles or pursuers matter at once the table promises nothing.
+            # Where two obstacles or pursuers matter at once, or after its time, a table promises nothing.
             several = scenario.obstacle_count > 1 or scenario.pursuer_count > 1
-            return TableShield(scenario, table, crowded=JointShield(scenario) if several else None)
+            decided = table.periods is None and not several
+            return TableShield(scenario, table, otherwise=None if decided else JointShield(scenario))
     if name == "joint:table":
-        return TableShield(scenario, table_for(scenario))
+        return TableShield(scenario, table_for(scenario), budget=budget)
     kind: Any = (SHIELDS | JOINT_FORMS)[name]
     return kind(scenario, budget=budget) if name in PURSUIT_SHIELDS else kind(scenario)
 
@@ -131,7 +132,7 @@ def name_of(shield: Shield, scenario: Scenario) -> str | None:
             alike = eqx.tree_equal(shield, TableShield(scenario, shield.table))
             return (
                 "joint:table"
-                if bool(alike) and shield.table.game == ClearanceGame.of(scenario, spare=SPARE)
+                if bool(alike) and shield.table.game == ClearanceGame.of(scenario, spare=SPARE, nearest=True)
                 else None
             )
         names = ["joint", "joint:table"]

@@ -48,7 +48,8 @@ _LEAVE = 1.25
 """Factor on the distances of `near_...` once the shield looks ahead, for a robot with motors."""
 
 
-def _real_or_none(value: Any) -> Any:
+def real_or_none(value: Any) -> Any:
+    """A field that may be None, as a real number."""
     return None if value is None else real(value)
 
 
@@ -150,7 +151,7 @@ class JointShield(Shield):
     margin: Scalar = eqx.field(converter=real, default=0.02)
     horizon: Scalar = eqx.field(converter=real, default=8.0)
     budget: Budget | None = None
-    acceleration: Scalar | None = eqx.field(converter=_real_or_none, default=None)
+    acceleration: Scalar | None = eqx.field(converter=real_or_none, default=None)
     steps: int = eqx.field(static=True, default=160)
     models: tuple[str, ...] = eqx.field(static=True, default=MODELS)
 

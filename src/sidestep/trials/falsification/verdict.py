@@ -31,6 +31,7 @@ ASSUMPTIONS: dict[str, str] = {
     "alone": "the rows towards pursuer and obstacles can be kept together",
     "gaps": "obstacles stay so far apart that one at a time matters (the clearance table)",
     "table": "between its nodes the clearance table is right",
+    "in-time": "what the clearance table keeps for some seconds can be kept for longer",
 }
 """The assumptions of the shields' guarantees, by the names that verdicts use."""
 
@@ -108,6 +109,10 @@ def _judge_table(scenario: Scenario, table: ClearanceTable, trajectory: Trajecto
     start: World = jax.tree.map(lambda leaf: leaf[0], trajectory.worlds)
     if scenario.pursuer_count != 1:
         return Verdict("one-pursuer", f"there are {scenario.pursuer_count} pursuers")
+    clearance = float(np.min(np.asarray(trajectory.events.pursuer_clearance)))
+    if trajectory.outcome == "captured" and clearance >= -table.game.shortfall - _exact(trajectory):
+        words = f"caught {-1e3 * clearance:.3g} mm deep; at this control period "
+        return Verdict("sampling", f"{words}{1e3 * table.game.shortfall:.3g} mm cannot be ruled out")
     margin = float(TableShield(scenario, table).margin(start))
     if margin < 0.0:
         return Verdict(
@@ -123,6 +128,9 @@ def _judge_table(scenario: Scenario, table: ClearanceTable, trajectory: Trajecto
                 f"two obstacles came within {apart.min():.3g} m of each other; its table is for {gap:.3g} m"
             )
             return Verdict("gaps", words)
+    if table.periods is not None:
+        seconds = table.periods * table.game.control_period
+        return Verdict("in-time", f"its clearance table is for {seconds:.3g} s at a time, not for ever")
     return Verdict("table", "its clearance table is interpolated between its nodes, and not proved there")
 
 
