@@ -214,6 +214,9 @@ def _settle(
     transitions = _transitions(game, grid, resolution, ridge)
     nodes, driven, held = transitions.nodes, transitions.pursuer, transitions.evader
     angles, moves = directions.nodes, game.velocities(resolution.headings) * game.control_period
+    drift = game.obstacle_speed * game.control_period
+    # A wall grown by its drift is a wall so much nearer.
+    grown, spare = (0.0, game.spare + drift) if game.wall else (drift, game.spare)
     strides = np.array([grid.heights.count, grid.committed, grid.first_committed])
     changed = np.ones(grid.size, bool)
     table, after, choice = table.copy(), after.copy(), np.zeros(table.shape, np.int16)
@@ -229,8 +232,8 @@ def _settle(
             driven.turned[due],
             angles,
             ridge,
-            game.obstacle_speed * game.control_period,
-            game.spare,
+            grown,
+            spare,
         )
         if change <= tolerance or (periods is not None and sweeps >= periods):
             break
@@ -250,6 +253,7 @@ def _settle(
             angles,
             ridge,
             moves,
+            game.wall,
             most,
             choice,
         )

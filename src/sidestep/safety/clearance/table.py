@@ -50,6 +50,8 @@ class ClearanceTable(eqx.Module):
     pursuer's, is what then keeps R at the end of the period, whatever the pursuer does and however an
     obstacle of the game's speed drifts in it.
 
+    Where the game has a `wall`, p = q n: its normal times the evader's distance q > 0 to it.
+
     **Attributes:** `clearance`, `after` (nodes, angles) in units of `STEP`; `ridge` (nodes,) rad, from which
     the angles of a row count; `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed
     point, `change` the largest in the last of them, m.
@@ -118,15 +120,17 @@ class ClearanceTable(eqx.Module):
         """The least `margin` (m) after a period, in the pursuer's frame at its beginning.
 
         **Arguments:** the evader moves by `move` (m), the pursuer to any of `poses` (m, m, rad), the obstacle
-        by `drift` (m) in any of 16 directions.
+        by `drift` (m) in any of 16 directions. Below 0 also where the evader is then beyond a wall.
         """
         place = z + move
         angles = np.arange(16) * (np.pi / 8.0)
         around = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), place.dtype)
 
         def after(pose: Float[Array, "3"], way: Float[Array, "2"]) -> Scalar:
-            moved = (offset + move - drift * way).astype(pose.dtype)
-            return self.margin(to_pursuer_frame(place, pose), to_pursuer_axes(moved, pose[2]))
+            moved, distance = self._moved(offset, move - drift * way)
+            seen = to_pursuer_axes(moved.astype(pose.dtype), pose[2])
+            height, clearance = self(to_pursuer_frame(place, pose), seen)
+            return jnp.minimum(height, distance - clearance)
 
         every = jax.vmap(jax.vmap(after, in_axes=(None, 0)), in_axes=(0, None))
         return jnp.min(every(jnp.asarray(poses), around))
@@ -140,10 +144,17 @@ class ClearanceTable(eqx.Module):
     ) -> Scalar:
         """|p| - R (m) after a period, at least, whatever the pursuer does in it: by R', without h', at one
         look into the table. `drift` (m) of the obstacle in the period, at most that of the game."""
-        ahead, moved = self.grid.nearer(jnp, z[0] + move[0]), offset + move
+        ahead, (moved, distance) = self.grid.nearer(jnp, z[0] + move[0]), self._moved(offset, move)
         _, clearance = self._look(self.after, ahead, z[1] + move[1], moved)
         slower = self.game.obstacle_speed * self.game.control_period - drift
-        return jnp.hypot(moved[0], moved[1]) - clearance + self.game.spare + slower
+        return distance - clearance + self.game.spare + slower
+
+    def _moved(self, offset: Float[AnyArray, "2"], move: Float[AnyArray, "2"]) -> tuple[Any, Scalar]:
+        """In which direction from the obstacle or wall the evader is after a move, and how far, m."""
+        if not self.game.wall:
+            return offset + move, jnp.hypot(offset[0] + move[0], offset[1] + move[1])
+        distance = jnp.hypot(offset[0], offset[1])
+        return offset, distance + (offset[0] * move[0] + offset[1] * move[1]) / distance
 
     @property
     def farthest(self) -> float:
