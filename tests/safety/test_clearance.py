@@ -139,6 +139,21 @@ def test_longer_asks_for_more_and_no_time_for_nothing(solution):
     assert largest[1] <= GAME.collision_distance + 5 * closing
 
 
+def test_more_than_a_table_holds_is_refused(solution):
+    """It would wrap round to a small clearance."""
+    far = solution._replace(clearance=solution.clearance + 1.2)
+    with pytest.raises(ValueError, match=r"clearance of 1\.\d+ m: a table holds 1\.31 m at most"):
+        ClearanceTable.of(GAME, far)
+
+
+def test_a_table_of_some_periods_keeps_saying_so(solution, tmp_path):
+    path = tmp_path / "short.npz"
+    ClearanceTable.of(GAME, solution, 20).save(path)
+    assert ClearanceTable.load(path).periods == 20
+    ClearanceTable.of(GAME, solution).save(path)
+    assert ClearanceTable.load(path).periods is None
+
+
 def test_an_interrupted_solution_goes_on_and_ends_the_same(solution, tmp_path, monkeypatch):
     monkeypatch.setenv("SIDESTEP_CACHE", str(tmp_path))
     seen = []

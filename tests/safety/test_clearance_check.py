@@ -19,8 +19,8 @@ from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
 from sidestep.store.files import read_json
 
 ROOT = Path(__file__).parents[2]
-PATHS = sorted((ROOT / "src/sidestep/safety/clearance/tables").glob("*.npz"))
-EASY, NARROW = PATHS
+TABLES = ROOT / "src/sidestep/safety/clearance/tables"
+PATHS = EASY, NARROW = [TABLES / f"paper-{distance}.npz" for distance in ("0.10", "0.15")]
 # By region, away from the jumps, where the obstacle matters.
 BOXES = (
     Box(OPEN, (0.0325, 0.0326), (0.0019, 0.0020), (-2.679, -2.678)),
@@ -165,3 +165,8 @@ def test_a_campaign_goes_on_refuses_other_arguments_and_merges(tmp_path):
     assert result["boxes"] == 4
     assert result["share at least"] <= result["share"] <= result["share at most"]
     assert run("--merge", first, first).returncode != 0
+
+
+def test_a_table_that_is_not_for_ever_is_none_to_prove():
+    with pytest.raises(ValueError, match="it is for some periods"):
+        StoredTable(TABLES / "paper.npz")

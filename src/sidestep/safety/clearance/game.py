@@ -20,7 +20,7 @@ read: it absorbs what interpolation loses."""
 
 @dataclass(frozen=True)
 class ClearanceGame:
-    """An evader between one pursuer and one obstacle, in SI units.
+    """An evader between one pursuer and one obstacle, a disc or a straight `wall`, in SI units.
 
     The evader (`evader_speed` v_e, holonomic) decides once per `control_period` T; the pursuer (rim speed V,
     `half_axle` b) must stay at least `capture_distance` l away, the obstacle, which drifts at up to
@@ -28,6 +28,9 @@ class ClearanceGame:
     period. `angle` S' > S is the design angle of the set that the evader keeps from the pursuer; whether it
     `can_stop`, or always drives at full speed. `shortfall` (m) is how much more than `capture_distance` was
     asked for, where nobody can keep that for ever.
+
+    Beside a `wall` d is the distance to it, and v_c how fast it moves along its normal. It is no wall to the
+    pursuer: one that it stops too can do less.
     """
 
     evader_speed: float = field(metadata=within(above=0.0, most=1e3, unit="m/s"))
@@ -41,6 +44,7 @@ class ClearanceGame:
     angle: float = field(metadata=within(above=0.0, below=math.pi / 2.0, unit="rad"))
     can_stop: bool = True
     shortfall: float = field(default=0.0, metadata=within(least=0.0, most=1e3, unit="m"))
+    wall: bool = False
 
     @staticmethod
     def of(
@@ -81,6 +85,8 @@ class ClearanceGame:
         period, or an evader that has it easier."""
         if not scenario.built_in:
             return "it has robots of its own"
+        if self.wall:
+            return "its obstacles are discs, the table's is a wall"
         drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
         level = max(float(scenario.capture_distance) - self.shortfall, 0.0)
         compared = (
@@ -102,8 +108,8 @@ class ClearanceGame:
 
     @property
     def as_dict(self) -> dict[str, float]:
-        """Every number by name."""
-        return asdict(self)
+        """Every number by name; `wall` only where it is one, so that files of discs stay as they were."""
+        return {name: value for name, value in asdict(self).items() if name != "wall" or value}
 
     def velocities(self, headings: int) -> Float[np.ndarray, "n 2"]:
         """What the evader chooses from, m/s: full speed in evenly spread headings, those along the tip's

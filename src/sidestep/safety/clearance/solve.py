@@ -19,8 +19,6 @@ from sidestep.safety.clearance.game import ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Place, Spacing
 from sidestep.safety.sampled.flow_map import seen_from
 
-MOST = 1.3
-"""The largest clearance (m) that a table can hold."""
 _BLOCK = 64
 """Nodes whose transitions are computed at once."""
 _EVEN = 1e3
@@ -217,6 +215,9 @@ def _settle(
     transitions = _transitions(game, grid, resolution, ridge)
     nodes, driven, held = transitions.nodes, transitions.pursuer, transitions.evader
     angles, moves = directions.nodes, game.velocities(resolution.headings) * game.control_period
+    drift = game.obstacle_speed * game.control_period
+    # A wall grown by its drift is a wall so much nearer.
+    grown, spare = (0.0, game.spare + drift) if game.wall else (drift, game.spare)
     strides = np.array([grid.heights.count, grid.committed, grid.first_committed])
     changed = np.ones(grid.size, bool)
     table, after, choice = table.copy(), after.copy(), np.zeros(table.shape, np.int16)
@@ -232,8 +233,8 @@ def _settle(
             driven.turned[due],
             angles,
             ridge,
-            game.obstacle_speed * game.control_period,
-            game.spare,
+            grown,
+            spare,
         )
         if change <= tolerance or (periods is not None and sweeps >= periods):
             break
@@ -253,6 +254,7 @@ def _settle(
             angles,
             ridge,
             moves,
+            game.wall,
             most,
             choice,
         )
@@ -325,11 +327,6 @@ def solve(
     velocity keeps the pursuit barrier: the design angle does not suit the capture distance and the period.
     """
     resolution = Resolution() if resolution is None else resolution
-    if not game.collision_distance <= most <= MOST:
-        raise ValueError(
-            f"most = {most:g} m: it must lie between the collision distance and {MOST:g} m, which is the "
-            "largest clearance that a table can hold"
-        )
     check(game, title="clearance game: ")
     check(resolution, title="resolution: ")
     if resolution.angles % 2:

@@ -48,6 +48,10 @@ class StoredTable:
             self.ridge = arrays["['ridge']"].astype(float)
             self.width = self.shares[2] + self.bearings
             shape = (self.heights[2] * (self.heights[2] + self.width), self.count)
+            if self.game.get("wall"):
+                raise ValueError("it is of a wall; `check` has no bounds for one")
+            if about.get("periods") is not None:
+                raise ValueError("it is for some periods; `check` proves tables for ever")
             if self.rows.shape != shape or self.ridge.shape != shape[:1]:
                 raise ValueError(f"{self.rows.shape} clearances, not {shape}")
             least = self.game["collision_distance"] - 1e-6

@@ -13,6 +13,9 @@ ray phi of
     |rho e_phi + u T| = R'(z + u T, direction of rho e_phi + u T).
 
 A node's new clearance R is the least such rho, or the old one if that is larger.
+
+Beside a straight wall p = q n, with n its normal and q the evader's distance to it. Only n.u changes q, and
+only the pursuer's turns change n: rho = R'(z + u T, direction of n) - n.u T.
 """
 
 from __future__ import annotations
@@ -162,6 +165,7 @@ def evader_moves(
     angles,
     ridge,
     moves,
+    straight,
     most,
     choice,
 ):
@@ -169,8 +173,9 @@ def evader_moves(
 
     **Arguments:** `after` (nodes, angles) R', m; pairs `spans[i, 0]` to `spans[i, 1]` are the velocities
     `control` that node `nodes[i]` may choose, `moves` (controls, 2) m each in one period; `place`, `share`
-    and `turned` as for `pursuer_moves`, for every pair where R' has it; `most`, m, stands
-    for every larger clearance; `choice` (nodes, angles), changed in place, the pair last found best.
+    and `turned` as for `pursuer_moves`, for every pair where R' has it; whether the obstacle is a
+    `straight` wall; `most`, m, stands for every larger clearance; `choice` (nodes, angles), changed in
+    place, the pair last found best.
     """
     count = len(angles)
     result = np.empty((len(nodes), count), np.float32)
@@ -193,7 +198,7 @@ def evader_moves(
                     _mixed(after, place[pair], strides, share[pair, 0], share[pair, 1], rows[one])
                     known[one] = True
                 x, y = moves[control[pair], 0], moves[control[pair], 1]
-                ahead, aside = cosine * x + sine * y, cosine * y - sine * x
+                ahead, aside = cosine * x + sine * y, 0.0 if straight else cosine * y - sine * x
                 root = _root(
                     rows[one], angles, turned[pair, 0], turned[pair, 1], direction, ahead, aside, most
                 )

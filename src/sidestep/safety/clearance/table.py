@@ -53,6 +53,8 @@ class ClearanceTable(eqx.Module):
     at the end of the period, whatever the pursuer does and however an obstacle of the game's speed drifts in
     it.
 
+    Where the game has a `wall`, p = q n: its normal times the evader's distance q > 0 to it.
+
     **Attributes:** `clearance`, `after` (nodes, angles) in units of `STEP`; `ridge` (nodes,) rad, from which
     the angles of a row count; `game`, `grid` and `directions` what it was solved for; `sweeps` of the fixed
     point, `change` the largest in the last of them, m; `periods` that the evader stays free, None for ever.
@@ -70,7 +72,10 @@ class ClearanceTable(eqx.Module):
 
     @staticmethod
     def of(game: ClearanceGame, solution: Solution, periods: int | None = None) -> ClearanceTable:
-        """The table of a solution, and of the `periods` that it was solved for."""
+        """The table of a solution, and of the `periods` that it was solved for.
+
+        **Raises** `ValueError` for more clearance than a table holds, 1.3 m.
+        """
         return ClearanceTable(
             _counted(solution.clearance),
             _counted(solution.after),
@@ -123,15 +128,17 @@ class ClearanceTable(eqx.Module):
         """The least `margin` (m) after a period, in the pursuer's frame at its beginning.
 
         **Arguments:** the evader moves by `move` (m), the pursuer to any of `poses` (m, m, rad), the obstacle
-        by `drift` (m) in any of 16 directions.
+        by `drift` (m) in any of 16 directions. Below 0 also where the evader is then beyond a wall.
         """
         place = z + move
         angles = np.arange(16) * (np.pi / 8.0)
         around = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), place.dtype)
 
         def after(pose: Float[Array, "3"], way: Float[Array, "2"]) -> Scalar:
-            moved = (offset + move - drift * way).astype(pose.dtype)
-            return self.margin(to_pursuer_frame(place, pose), to_pursuer_axes(moved, pose[2]))
+            moved, distance = self._moved(offset, move - drift * way)
+            seen = to_pursuer_axes(moved.astype(pose.dtype), pose[2])
+            height, clearance = self(to_pursuer_frame(place, pose), seen)
+            return jnp.minimum(height, distance - clearance)
 
         every = jax.vmap(jax.vmap(after, in_axes=(None, 0)), in_axes=(0, None))
         return jnp.min(every(jnp.asarray(poses), around))
@@ -145,10 +152,17 @@ class ClearanceTable(eqx.Module):
     ) -> Scalar:
         """|p| - R (m) after a period, at least, whatever the pursuer does in it: by R', without h', at one
         look into the table. `drift` (m) of the obstacle in the period, at most that of the game."""
-        ahead, moved = self.grid.nearer(jnp, z[0] + move[0]), offset + move
+        ahead, (moved, distance) = self.grid.nearer(jnp, z[0] + move[0]), self._moved(offset, move)
         _, clearance = self._look(self.after, ahead, z[1] + move[1], moved)
         slower = self.game.obstacle_speed * self.game.control_period - drift
-        return jnp.hypot(moved[0], moved[1]) - clearance + self.game.spare + slower
+        return distance - clearance + self.game.spare + slower
+
+    def _moved(self, offset: Float[AnyArray, "2"], move: Float[AnyArray, "2"]) -> tuple[Any, Scalar]:
+        """In which direction from the obstacle or wall the evader is after a move, and how far, m."""
+        if not self.game.wall:
+            return offset + move, jnp.hypot(offset[0] + move[0], offset[1] + move[1])
+        distance = jnp.hypot(offset[0], offset[1])
+        return offset, distance + (offset[0] * move[0] + offset[1] * move[1]) / distance
 
     @property
     def farthest(self) -> float:
@@ -263,7 +277,14 @@ def _counted(clearance: np.ndarray) -> UInt16[Array, "n k"]:
     """Clearances (m) in units of `STEP`, rounded up but for rounding errors."""
     if clearance.dtype == np.uint16:
         return jnp.asarray(clearance)
-    return jnp.asarray(np.ceil(clearance.astype(float) / STEP - 1e-3).astype(np.uint16))
+    counts = np.ceil(clearance.astype(float) / STEP - 1e-3)
+    most = np.iinfo(np.uint16).max
+    if np.max(counts) > most:
+        raise ValueError(
+            f"a clearance of {np.max(clearance):.3g} m: a table holds {most * STEP:.3g} m at most; take a "
+            "smaller `most`, or fewer periods"
+        )
+    return jnp.asarray(counts.astype(np.uint16))
 
 
 def _write(path: str | Path, solution: Solution | ClearanceTable, **about: Any) -> None:
