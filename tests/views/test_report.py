@@ -148,6 +148,7 @@ def test_figures_are_left_beside_the_report_in_both_formats(whole):
     for figure in (
         "reward",
         "reward-column",
+        "times",
         "clearances",
         "interventions",
         "safety",

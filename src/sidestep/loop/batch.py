@@ -101,7 +101,8 @@ class EpisodeBatch:
     The width does not depend on the number of episodes, and free slots are refilled: each width compiles
     separately, which takes longer than ten thousand episodes.
 
-    **Attributes:** `results` per episode: `outcome` and the fields of `Tally` by name; `sums`, the result of `trial.read`, 0 without.
+    **Attributes:** `results` per episode: `outcome` and the fields of `Tally` by name; `sums`, the result of
+    `trial.read`, 0 without.
     """
 
     def __init__(self, trial: Trial, begin: int, end: int):

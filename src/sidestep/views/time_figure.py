@@ -17,8 +17,8 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
     """Mean time to the target of the last 20 training episodes, on a logarithmic axis.
 
     An episode that did not reach the target counts as the time limit. Per shield as in `reward_figure`. At
-    the right edge, from evaluations without exploration noise if there are any: a dot for the trained policy,
-    a tick for goal-seeking behind the same shield. Grey: the same episodes' time straight to the target at
+    the right edge, from evaluations without exploration noise if there are any: filled, the trained policy;
+    hollow, goal-seeking behind the same shield. Grey: the same episodes' time straight to the target at
     full speed, unless they were recorded by a version that did not keep it. Writes PNG and PDF.
     """
     groups = by_shield(runs)
@@ -29,16 +29,15 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = style.shield_colour(shield, position), style.shield_words(shield)
             draw_means(axes, [_times(run) for run in group], colour, words, style.shield_dashes(shield))
-            for field, marker, face in (("evaluation", "o", colour), ("untrained_evaluation", "D", "white")):
-                found = [
-                    one["time_mean"] for run in group if "time_mean" in (one := getattr(run, field) or {})
-                ]
-                if found:
-                    place = (1.01 + 0.012 * position) * longest
-                    axes.plot(
-                        place, np.mean(found), marker, color=colour, markerfacecolor=face, clip_on=False,
-                        markersize=5, zorder=5,
-                    )  # fmt: skip
+            place = (1.015 + 0.02 * position) * longest
+            for field, look in (
+                ("evaluation", style.mark(colour, 5)),
+                ("untrained_evaluation", style.mark("white", 4.5, colour, 1.2)),
+            ):
+                reports = [getattr(run, field) or {} for run in group]
+                times = [report["time_mean"] for report in reports if "time_mean" in report]
+                if times:
+                    axes.plot(place, np.mean(times), marker="o", clip_on=False, zorder=5, **look)
         straight = [times for run in runs if len(times := _straight(run))]
         if straight:
             shortest = min(len(times) for times in straight)
