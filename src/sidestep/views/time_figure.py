@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from sidestep.store.runs import CONVERGENCE_WINDOW
 from sidestep.views import style
@@ -29,26 +31,40 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = style.shield_colour(shield, position), style.shield_words(shield)
             draw_means(axes, [_times(run) for run in group], colour, words, style.shield_dashes(shield))
-            place = (1.015 + 0.02 * position) * longest
-            for field, look in (
-                ("evaluation", style.mark(colour, 5)),
-                ("untrained_evaluation", style.mark("white", 4.5, colour, 1.2)),
+            for field, place, look in (
+                ("evaluation", 1.01, style.mark(colour, 5)),
+                ("untrained_evaluation", 1.02, style.mark("white", 4.5, colour, 1.2)),
             ):
                 reports = [getattr(run, field) or {} for run in group]
                 times = [report["time_mean"] for report in reports if "time_mean" in report]
                 if times:
-                    axes.plot(place, np.mean(times), marker="o", clip_on=False, zorder=5, **look)
+                    axes.plot(
+                        (place + 0.025 * position) * longest,
+                        np.mean(times),
+                        marker="o",
+                        clip_on=False,
+                        zorder=5,
+                        **look,
+                    )
         straight = [times for run in runs if len(times := _straight(run))]
         if straight:
             shortest = min(len(times) for times in straight)
             means = np.mean([times[:shortest] for times in straight], axis=0)
             draw_means(axes, [means], style.FAINT, "straight there, alone")
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(ScalarFormatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())
         style.light_grid(axes, "y")
         axes.set_xlabel("training episode")
         axes.set_ylabel("mean time, s")
         style.panel_titles([axes], [f"Mean time to the target of the last {CONVERGENCE_WINDOW} episodes"])
-        axes.legend(loc="upper right", ncols=3)
+        handles, _ = axes.get_legend_handles_labels()
+        ends = {
+            "trained policy": style.mark(style.INK, 5),
+            "goal-seeking": style.mark("white", 4.5, style.INK, 1.2),
+        }
+        handles += [Line2D([], [], marker="o", label=label, **look) for label, look in ends.items()]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         return style.save(figure, path)
 
 
