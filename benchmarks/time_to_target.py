@@ -3,10 +3,9 @@
     python benchmarks/time_to_target.py pretrained --episodes 300 --out benchmarks/results/time_to_target.json
     python benchmarks/time_to_target.py runs/mine --shield game --pursuers nash interceptor --out mine.json
 
-Both policies get the same starts, targets and pursuers. An episode that did not reach the target, for
-whatever reason, counts as the time limit. `straight` is the time straight there at full speed, which nobody
-can beat. The difference is that of each start, with a 95 % bootstrap interval. No training meets the
-`chauffeur` and the falsifier's `herder` and `sideswiper`. An interrupted study goes on where it stopped.
+What is compared, and how, is what `sidestep evaluate RUN` prints (`sidestep.trials.yardsticks`), here for
+many pursuers. `straight` is the time straight there at full speed, which nobody can beat. No training meets
+the `chauffeur` and the falsifier's `herder` and `sideswiper`. An interrupted study goes on where it stopped.
 """
 
 import argparse
@@ -16,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 import study_blocks
 from machine import machine, versions
 from sidestep.commands.common import policy_and_scenario
 from sidestep.pursuit import PURSUERS, make_pursuer
 from sidestep.store.files import write_json
-from sidestep.trials import Evaluation, evaluate
+from sidestep.trials import take_yardsticks
 from sidestep.trials.falsification.attackers import herder, sideswiper
-from sidestep.trials.statistics import stratified_bootstrap
+from sidestep.trials.yardsticks import time_figures
 
 HELD_OUT = ("chauffeur", "herder", "sideswiper")
 LIMIT = 120.0
@@ -40,13 +38,6 @@ def pursuer_named(name: str) -> Any:
     return make_pursuer(name)
 
 
-def figures(evaluation: Evaluation) -> dict[str, Any]:
-    """What is told of one policy."""
-    every = evaluation.to_dict()
-    names = ("captured", "collided", "reached", "timed_out", "time_mean", "reached_by", "intervention_rate")
-    return {name: every[name] for name in names}
-
-
 def main() -> int:
     """Run the study; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -55,6 +46,7 @@ def main() -> int:
     parser.add_argument("--pursuers", nargs="*", default=[*PURSUERS, *HELD_OUT], metavar="NAME")
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1_000_000)
+    parser.add_argument("--planner", action="store_true", help="also measure the planner")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="scenario fields")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
@@ -63,40 +55,37 @@ def main() -> int:
     scenario = dataclasses.replace(scenario, episode_steps=steps)
     settings = {
         "run": arguments.run, "shield": arguments.shield, "episodes": arguments.episodes,
-        "seed": arguments.seed, "set": arguments.set, "time_limit": LIMIT,
+        "seed": arguments.seed, "set": arguments.set, "planner": arguments.planner, "time_limit": LIMIT,
     }  # fmt: skip
     study = study_blocks.earlier(arguments.out, settings) or {"settings": settings, "pursuers": {}}
     for name in arguments.pursuers:
         if name in study["pursuers"]:
             continue
         begun = time.perf_counter()
-        found = {
-            label: evaluate(
-                scenario, driver, arguments.shield, pursuer_named(name), arguments.episodes, arguments.seed
-            )
-            for label, driver in (("policy", policy), ("goal-seeking", "goal-seeking"))
-        }
-        one, other = found["policy"].times_to_target, found["goal-seeking"].times_to_target
-        straight = found["policy"].straight_times
-        assert straight is not None
+        yardsticks = take_yardsticks(
+            scenario, policy, arguments.shield, pursuer_named(name), arguments.episodes, arguments.seed,
+            planner=arguments.planner,
+        )  # fmt: skip
         study["pursuers"][name] = {
-            **{label: figures(evaluation) for label, evaluation in found.items()},
-            "difference": stratified_bootstrap([one - other], np.mean)._asdict(),
-            "ratio": float(np.mean(one) / np.mean(other)),
-            "straight": float(np.mean(straight)),
+            "policy": time_figures(yardsticks.evaluation),
+            **yardsticks.to_dict(),
+            "straight": yardsticks.evaluation.to_dict()["straight_time_mean"],
             "seconds": time.perf_counter() - begun,
         }
         study |= {"machine": machine(), "versions": versions()}
         write_json(arguments.out, study)
         line = study["pursuers"][name]
-        print(
-            f"{name:20s} policy {line['policy']['time_mean']:6.1f} s ({line['policy']['reached']} reached, "
-            f"{line['policy']['intervention_rate']:.0%} corrected), goal-seeking "
-            f"{line['goal-seeking']['time_mean']:6.1f} s ({line['goal-seeking']['reached']}, "
-            f"{line['goal-seeking']['intervention_rate']:.0%}), difference "
-            f"{line['difference']['low']:+.1f} to {line['difference']['high']:+.1f} s",
-            flush=True,
-        )
+        words = [
+            f"{label} {line[label]['time_mean']:.1f} s ({line[label]['reached']} reached, "
+            f"{line[label]['intervention_rate']:.0%} corrected)"
+            for label in ("policy", "goal-seeking", "planner")
+            if label in line
+        ]
+        less = line["goal-seeking"]["difference"]
+        words.append(f"difference to goal-seeking {less['low']:+.1f} to {less['high']:+.1f} s")
+        if line["share_of_planner"] is not None:
+            words.append(f"{line['share_of_planner']['estimate']:.0%} of the way to the planner")
+        print(f"{name:20s} {', '.join(words)}", flush=True)
     return 0
 
 

@@ -89,7 +89,23 @@ def test_evaluation_reports_counts_with_their_bounds(run, tmp_path):
     for name in ("captured", "collided", "reached", "timed_out"):
         assert figures[f"{name}_rate_low"] <= figures[f"{name}_rate"] <= figures[f"{name}_rate_high"]
     assert "reach_time_median" in figures
+    assert set(figures["yardsticks"]) == {"goal-seeking", "share_of_planner"}
+    assert figures["yardsticks"]["goal-seeking"]["difference"]["low"] is not None
     assert figures["shield"] == "game"
+
+
+def test_times_are_printed_beside_goal_seeking_and_the_planner(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    small = ["--set", "episode_steps=400", "--episodes", "10", "--batch", "10"]
+    small += ["--shield", "game", "--pursuer", "interceptor"]
+    assert main(["evaluate", "goal-seeking", "--planner", *small]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "within 15 s" in words
+    assert "within 30 s" not in words
+    assert "An episode that does not reach the target counts 20 s." in words
+    assert "Mean difference to planner, start by start: +" in words
+    assert main(["evaluate", "planner", *small]) == 0
+    assert "Mean difference to goal-seeking, start by start: -" in " ".join(capsys.readouterr().out.split())
 
 
 def test_untrained_policy_is_evaluated_under_the_joint_shield_by_default(tmp_path):

@@ -263,9 +263,10 @@ def test_evaluate_logs_the_episode_that_was_asked_for(tmp_path, capsys, monkeypa
 
     # What is measured is tested elsewhere, and would take longest here.
     closest = {"min_pursuer_clearance": np.array([0.2, 0.3, 0.4]), "min_obstacle_clearance": [9.0, 0.1, 9.0]}
-    measured = SimpleNamespace(to_dict=dict, **closest)
-    monkeypatch.setattr(sidestep.trials, "evaluate", lambda *_, **__: measured)
+    measured = SimpleNamespace(to_dict=dict, evaluation=SimpleNamespace(to_dict=dict, **closest))
+    monkeypatch.setattr(sidestep.trials, "take_yardsticks", lambda *_, **__: measured)
     monkeypatch.setattr(evaluate, "evaluation_table", lambda _: "")
+    monkeypatch.setattr(evaluate, "time_table", lambda *_: "")
     path = tmp_path / "one.mcap"
     command = ["evaluate", "goal-seeking", "--shield", "none", "--pursuer", "still"]
     command += ["--episodes", "3", "--batch", "3", "--set"]

@@ -24,6 +24,7 @@ OPTIONS = {
     "exploration_noise": 0.1,
     "reward_scale": 0.01,
     "correction_penalty": 0.0,
+    "time_cost": 0.0,
     "replay_action": "proposed",
     "filter_gradients": False,
     "bound_values": True,

@@ -17,6 +17,7 @@ NOT_NEGATIVE = {
     "exploration_noise",
     "reward_scale",
     "correction_penalty",
+    "time_cost",
     "actor_learning_rate",
     "critic_learning_rate",
     "target_noise",

@@ -87,15 +87,16 @@ def draw(replay, key, **more):
     return batch, after
 
 
-def draw_all(replay, key, rows=512, *, mirror=0.0, hindsight=1.0, executed=False, penalty=0.0, scale=1.0):
+def draw_all(
+    replay, key, rows=512, *, mirror=0.0, hindsight=1.0, executed=False, penalty=0.0, time_cost=0.0, scale=1.0
+):
     scenario = load_scenario("paper", reach_distance=REACH)
-    return _draw(
-        scenario, replay, key, rows, real(hindsight), real(mirror), executed, real(penalty), real(scale)
-    )
+    numbers = [real(number) for number in (penalty, time_cost, scale)]
+    return _draw(scenario, replay, key, rows, real(hindsight), real(mirror), executed, *numbers)
 
 
 @eqx.filter_jit
-def _draw(scenario, replay, key, rows, hindsight, mirror, executed, penalty, scale):
+def _draw(scenario, replay, key, rows, hindsight, mirror, executed, penalty, time_cost, scale):
     return sample(
         scenario,
         replay,
@@ -105,6 +106,7 @@ def _draw(scenario, replay, key, rows, hindsight, mirror, executed, penalty, sca
         mirror=mirror,
         executed_action=executed,
         correction_penalty=penalty,
+        time_cost=time_cost,
         reward_scale=scale,
     )
 
@@ -254,6 +256,26 @@ def test_penalty_scale_and_choice_of_action_are_read_as_asked():
     np.testing.assert_array_equal(plain.observation, executed.observation)
 
 
+def test_time_cost_lowers_the_reward_by_the_time_that_is_driven():
+    *_, (replay, _) = fill((8,), steps_of=lambda count: 1 + count % PERIODS)
+    key = jax.random.key(3)
+    plain, after = draw(replay, key, hindsight=0.0)
+    costly, _ = draw(replay, key, hindsight=0.0, time_cost=3.0, scale=0.5)
+    # Nothing is reached, so every transition is driven to its end.
+    seconds = 0.05 * (1 + np.asarray(after.time).round() % PERIODS)
+    assert len(np.unique(seconds)) == PERIODS
+    np.testing.assert_allclose(costly.reward, 0.5 * (plain.reward - 3.0 * seconds), rtol=1e-5)
+
+
+def test_time_cost_ends_when_a_target_is_reached_on_the_way():
+    scenario = load_scenario("paper", reach_distance=0.01)
+    transition = made_up(2)
+    target = transition.path[1]
+    (free, reached), (costly, _) = (reward_along(scenario, transition, target, real(c)) for c in (0.0, 3.0))
+    assert bool(reached)
+    assert float(free - costly) == pytest.approx(3.0 * 0.05, abs=1e-4)
+
+
 # Mirror and frame ------------------------------------------------------------------------------------------
 
 
@@ -306,7 +328,8 @@ def test_robots_of_ones_own_are_mirrored_with_what_they_keep_or_not_at_all(model
         replay = add(replay, own_transition(world), jnp.asarray(0), jnp.asarray(True))
     numbers = jax.random.key(5), 64, real(0.0)
     (plain, before, _), (image, mirrored, _) = (
-        _draw(scenario, replay, *numbers, real(share), False, real(0.0), real(1.0)) for share in (0.0, 1.0)
+        _draw(scenario, replay, *numbers, real(share), False, real(0.0), real(0.0), real(1.0))
+        for share in (0.0, 1.0)
     )
     flip = np.array([1.0, -1.0]) if isinstance(model, Quadrotor) else 1.0
     np.testing.assert_array_equal(mirrored.evader, before.evader * flip)
@@ -439,7 +462,7 @@ def test_stored_decisions_and_metrics_are_what_the_physics_did(driven):
         world, events = scenario.step(world, result.action, wheels)
         return world, memory, result, events
 
-    relabelled = jax.jit(lambda one: reward_along(scenario, one, one.world.target))
+    relabelled = jax.jit(lambda one: reward_along(scenario, one, one.world.target, real(0.0)))
     first_of_episode, env_steps = True, 0
     ends = []
     for index in range(len(stored.steps)):

@@ -111,7 +111,9 @@ def test_other_numbers_do_not_compile_anything_again(small, small_run):
         "mirror": 0.1,
         "reward_scale": 0.02,
     }
-    options = small.options(**numbers, exploration_noise=0.3, correction_penalty=0.5, target_noise=0.1)
+    options = small.options(
+        **numbers, exploration_noise=0.3, correction_penalty=0.5, time_cost=0.2, target_noise=0.1
+    )
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         training = small.train(scenario, options, seed=5)
@@ -226,6 +228,7 @@ def test_executed_actions_are_learned_from_through_the_shield_of_their_own_world
             "mirror": options.mirror,
             "executed_action": True,
             "correction_penalty": options.correction_penalty,
+            "time_cost": options.time_cost,
             "reward_scale": options.reward_scale,
         }
         batch, before, after = sample(scenario, replay, sample_key, 16, **settings)

@@ -18,6 +18,7 @@ from sidestep.views import (
     safety_table,
     scenes_figure,
     style,
+    time_figure,
     trajectory_figure,
 )
 from sidestep.views.scene import capture_set_outline, mark_periods
@@ -51,6 +52,33 @@ def test_reward_figure_of_many_seeds_of_different_length(tmp_path, run_of):
         for seed in range(3)
     ]
     assert_fine(reward_figure(runs, tmp_path / "reward.png"))
+
+
+@pytest.mark.parametrize("count", [0, 19, 60])
+def test_time_figure_of_a_run_of_any_length(tmp_path, count, run_of):
+    assert_fine(time_figure([run_of(outcomes=("reached", "captured", "timed_out") * count)], tmp_path / "t"))
+
+
+def test_time_figure_counts_every_episode_that_did_not_arrive_as_the_limit(run_of, drawn):
+    outcomes = ("reached", "captured", "collided", "timed_out") * 10
+    metrics = [{**line, "straight_time": 4.0} for line in run_of(outcomes=outcomes).metrics]
+    old = run_of("none")
+    run = replace(
+        run_of(outcomes=outcomes), metrics=metrics, evaluation={"time_mean": 7.0},
+        untrained_evaluation={"time_mean": 9.0},
+    )  # fmt: skip
+    lines = drawn(lambda path: time_figure([old, run], path)).axes[0].get_lines()
+    curves = {line.get_label(): np.asarray(line.get_ydata()) for line in lines}
+    assert curves["game shield"][-1] == pytest.approx((5.0 + 3 * 250.0) / 4)
+    # The other run was recorded by a version without these times.
+    assert curves["straight there, alone"][-1] == pytest.approx(4.0)
+    assert len(curves["straight there, alone"]) == len(outcomes)
+    marks = [
+        (float(line.get_ydata()[0]), line.get_markerfacecolor())
+        for line in lines
+        if len(line.get_ydata()) == 1
+    ]
+    assert marks == [(7.0, style.shield_colour("game")), (9.0, "white")]
 
 
 def test_same_data_give_the_same_files(tmp_path, run_of):

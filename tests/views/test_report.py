@@ -94,7 +94,7 @@ def test_report_loads_nothing_from_anywhere(whole):
 
 def test_pictures_in_the_report_are_whole(whole):
     page = read(whole)
-    assert len(page.loads) == 8
+    assert len(page.loads) == 9
     for load in page.loads:
         picture = base64.b64decode(load.split(",")[1], validate=True)
         assert picture.startswith(b"\x89PNG")
@@ -148,6 +148,7 @@ def test_figures_are_left_beside_the_report_in_both_formats(whole):
     for figure in (
         "reward",
         "reward-column",
+        "times",
         "clearances",
         "interventions",
         "safety",

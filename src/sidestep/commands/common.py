@@ -116,8 +116,9 @@ def scenario_overrides(pairs: tuple[str, ...], *, zero: bool = False) -> dict[st
 def policy_and_scenario(
     run: str, scenario: str | None, overrides: tuple[str, ...]
 ) -> tuple[Any, Scenario, dict[str, Any]]:
-    """The policy of `run` (a folder, a policy file, pretrained or goal-seeking), and as `scenario_of_run`."""
-    if run == "goal-seeking":
+    """The policy of `run` (a folder, a policy file, pretrained, goal-seeking or planner), and as
+    `scenario_of_run`."""
+    if run in ("goal-seeking", "planner"):
         return run, *scenario_of_run(None, scenario, overrides)
     from sidestep.learning import PRETRAINED, load_policy
 

@@ -30,7 +30,8 @@ class Evaluate:
     """Measure a policy with a shield against a pursuer over random episodes, with 95 % bounds."""
 
     run: PolicyName = "goal-seeking"
-    """Run folder whose policy to evaluate, pretrained, or goal-seeking for the untrained one."""
+    """Run folder whose policy to evaluate, pretrained, goal-seeking for the untrained one, or planner for one
+    that knows the pursuer's strategy."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
@@ -41,6 +42,8 @@ class Evaluate:
     """Episodes to measure."""
     seed: int = bounded(0, SEED)
     """Seed of starts, targets and random pursuers."""
+    planner: bool = False
+    """Also compare with the planner, which knows the pursuer's strategy; 100 episodes take half a minute."""
     batch: int = bounded(512, SIDE_BY_SIDE)
     """Episodes that run at once."""
     set: Overrides = ()
@@ -60,7 +63,7 @@ def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
     from sidestep.loop import episode_key, rollout
     from sidestep.store.outputs import try_outputs
-    from sidestep.trials import evaluate as run_evaluation
+    from sidestep.trials import take_yardsticks
 
     check_options(command.film)
     try_outputs(files=[command.json], new=[command.log, command.film.video])
@@ -77,14 +80,16 @@ def run(command: Evaluate, console: Console) -> int:
         )
     shield = command.shield or config.get("shield", "joint")
     pursuer = command.pursuer or config.get("pursuer", "nash")
-    with CountBar(console, f"{shield} shield, {pursuer}") as show:
-        evaluation = run_evaluation(
-            scenario, policy, shield, pursuer, command.episodes, command.seed, batch=command.batch,
-            progress=show,
-        )  # fmt: skip
+    yardsticks = take_yardsticks(
+        scenario, policy, shield, pursuer, command.episodes, command.seed, planner=command.planner,
+        batch=command.batch, count_progress=lambda name: CountBar(console, f"{name}, {shield}, {pursuer}"),
+    )  # fmt: skip
+    evaluation, compared = yardsticks.evaluation, yardsticks.to_dict()
     console.print(evaluation_table(evaluation))
+    console.print(time_table(evaluation.to_dict(), compared))
     about = {"policy": command.run, "shield": shield, "pursuer": pursuer, "scenario": scenario.name}
-    write_json_file(command.json, {**evaluation.to_dict(), **about, "seed": command.seed})
+    figures = {**evaluation.to_dict(), "yardsticks": compared}
+    write_json_file(command.json, {**figures, **about, "seed": command.seed})
     if command.log is not None:
         about = {**about, "seed": command.seed, "episode": command.log_episode, "source": "simulation"}
         _write_log(command, scenario, policy, about, console)
@@ -138,8 +143,6 @@ def evaluation_table(evaluation: Evaluation) -> Any:
     median = figures["reach_time_median"]
     table.caption = (
         f"median time to reach {'-' if median is None else f'{median:.1f} s'}; "
-        f"mean {figures['time_mean']:.1f} s, where the others count {figures['time_limit']:g} s; "
-        f"straight there at full speed {figures['straight_time_mean']:.1f} s; "
         f"shield corrects {figures['intervention_rate']:.1%} of steps, cannot satisfy all rows in "
         f"{figures['infeasible_rate']:.2%}"
     )
@@ -147,4 +150,33 @@ def evaluation_table(evaluation: Evaluation) -> Any:
         table.caption += f", was given numbers that are not finite in {figures['invalid_rate']:.2%}"
     if figures["pursuer_invalid"]:
         table.caption += "; " + stood_still(figures["pursuer_invalid"], figures["pursuer_invalid_episodes"])
+    return table
+
+
+def time_table(figures: dict[str, Any], compared: dict[str, Any]) -> Any:
+    """Times to the target of the policy (`Evaluation.to_dict`) and of the others (`Yardsticks.to_dict`)."""
+    from rich.table import Table
+
+    limit, straight = figures["time_limit"], figures["straight_time_mean"]
+    times = [name for name in figures["reached_by"] if float(name) <= limit]
+    others = {name: other for name, other in compared.items() if name != "share_of_planner"}
+    table = Table("time to the target", "mean", *(f"within {time} s" for time in times), title="Same starts")
+    for name, one in {"this policy": figures, **others}.items():
+        shares = [f"{one['reached_by'][time]:.0%}" for time in times]
+        table.add_row(name, f"{one['time_mean']:.1f} s", *shares)
+    table.add_row("straight, alone", f"{straight:.1f} s")
+    sentences = [f"An episode that does not reach the target counts {limit:g} s."]
+    for name, other in others.items():
+        mean, low, high = (other["difference"][part] for part in ("estimate", "low", "high"))
+        sentences.append(
+            f"Mean difference to {name}, start by start: {mean:+.1f} s ({low:+.1f} to {high:+.1f}, 95 % "
+            f"bootstrap), {other['ratio']:.2f} of its time."
+        )
+    share = compared["share_of_planner"]
+    if share is not None:
+        sentences.append(
+            f"That is {share['estimate']:.0%} ({share['low']:.0%} to {share['high']:.0%}) of the way from "
+            "goal-seeking to the planner."
+        )
+    table.caption = " ".join(sentences)
     return table

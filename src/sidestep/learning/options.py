@@ -37,6 +37,8 @@ class TrainingOptions(eqx.Module):
     - `correction_penalty`: subtracted from the reward of a decision whose mean correction is v_e, in
       proportion to the correction, in units of the paper's reward. It penalises the proposed action; a critic
       of executed actions attributes it to the executed one.
+    - `time_cost`: subtracted from the reward for each second until the target or the end of the episode, 1/s,
+      in units of the paper's reward.
     - `anneal`: share of the episodes, at the end of the training, over which both learning rates fall to a
       twentieth, linearly; a training that is resumed for more episodes raises them again.
     - `replay_capacity`: largest number of transitions kept; never more than the training can produce.
@@ -47,6 +49,7 @@ class TrainingOptions(eqx.Module):
     hindsight: Scalar = eqx.field(converter=real, default=0.8, metadata=within(least=0.0, most=1.0))
     reward_scale: Scalar = eqx.field(converter=real, default=0.01, metadata=within(least=0.0))
     correction_penalty: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0))
+    time_cost: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0, unit="1/s"))
     mirror: Scalar = eqx.field(converter=real, default=0.5, metadata=within(least=0.0, most=1.0))
     anneal: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0, most=1.0))
     bound_values: bool = eqx.field(static=True, default=True)

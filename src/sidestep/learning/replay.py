@@ -101,9 +101,10 @@ class Replay(eqx.Module):
 
 
 def reward_along(
-    scenario: Scenario, transition: Transition, target: Float[Array, "2"]
+    scenario: Scenario, transition: Transition, target: Float[Array, "2"], time_cost: Scalar
 ) -> tuple[Scalar, Bool[Array, ""]]:
-    """Sum of the paper's reward over a decision for the given target (m), and whether the episode terminates.
+    """Sum of the paper's reward over a decision for the given target (m), less `time_cost` (1/s) times the
+    time driven until it is reached, and whether the episode terminates.
 
     The evader moves straight between control instants, so the least distance to the target is exact. In its
     last period a lost episode gets no bonus for reaching the target.
@@ -122,6 +123,7 @@ def reward_along(
     offset = knots[1:] - target
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
     cost = -scenario.distance_cost * jnp.sum(jnp.where(ran & (index < first), distance, 0.0))
+    cost -= time_cost * jnp.sum(jnp.where(ran & (index <= first), scenario.control_period, 0.0))
     return cost + jnp.where(reached, scenario.reach_reward, 0.0), reached | transition.lost
 
 
@@ -166,6 +168,7 @@ def sample(
     mirror: Float[Array, ""],
     executed_action: bool,
     correction_penalty: Float[Array, ""],
+    time_cost: Float[Array, ""],
     reward_scale: Float[Array, ""],
 ) -> tuple[Batch, World, World]:
     """A batch of uniformly sampled transitions, a share `hindsight` of them with a position reached later as
@@ -173,7 +176,8 @@ def sample(
 
     The later position is uniform over the rest of the same episode (the "future" strategy). The action is the
     proposed or the executed velocity in the policy's axes *for that target*. The reward is `reward_scale`
-    times the sum less `correction_penalty` times the mean correction (as a share of v_e).
+    times the sum (less the `time_cost`, see `reward_along`) less `correction_penalty` times the mean
+    correction (as a share of v_e).
 
     **Returns** the batch, and the worlds before and after its actions, with the sampled targets and mirrored
     like the batch, so that a shield can be evaluated in them.
@@ -202,7 +206,9 @@ def sample(
     def with_target(world: World) -> World:
         return eqx.tree_at(lambda w: w.target, world, target)
 
-    reward, terminated = jax.vmap(reward_along, in_axes=(None, 0, 0))(scenario, picked, target)
+    reward, terminated = jax.vmap(reward_along, in_axes=(None, 0, 0, None))(
+        scenario, picked, target, time_cost
+    )
     model = scenario.evader_model
     share = mirror if _has_mirror_images(model, picked.world.evader_state) else 0.0
     flip = jax.random.uniform(mirror_key, (batch_size,), dtype=float) < share

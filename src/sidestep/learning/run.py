@@ -23,6 +23,7 @@ from sidestep.learning.options import TrainingOptions, make_options, options_to_
 from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
 from sidestep.learning.td3 import Learner
 from sidestep.learning.training import Report, TrainState, run_chunk, start
+from sidestep.loop.episode import straight_times
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.store import runs as records
@@ -81,10 +82,11 @@ def _name(thing: Any) -> str:
     return getattr(thing, "name", getattr(thing, "__name__", type(thing).__name__))
 
 
-def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
+def _episode_lines(scenario: Scenario, report: Report, done: int) -> list[dict[str, Any]]:
     """The lines of `metrics.jsonl` for the episodes that ended in a chunk."""
     ended = np.nonzero(np.asarray(report.ended))
     tally = jax.tree.map(lambda leaf: np.asarray(leaf)[ended], report.tally)
+    straight = straight_times(scenario, tally.distance)
     outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended[0]]
     return [
         json_safe(
@@ -93,6 +95,7 @@ def _episode_lines(report: Report, done: int) -> list[dict[str, Any]]:
                 "outcome": records.OUTCOMES[outcome[i]],
                 "return": tally.total_reward[i],
                 "steps": tally.steps[i],
+                "straight_time": straight[i],
                 "env_steps": env_steps[i],
                 "min_pursuer_clearance": tally.pursuer_clearance[i],
                 "min_obstacle_clearance": tally.obstacle_clearance[i],
@@ -260,7 +263,7 @@ def _run(
             diverged = divergence(report, reached.learner, len(metrics))
             if diverged is not None:
                 break
-            lines = _episode_lines(report, len(metrics))
+            lines = _episode_lines(scenario, report, len(metrics))
             # One statement, so that state and metrics are consistent at an interrupt.
             state, metrics = reached, metrics + lines
             now = time.perf_counter()

@@ -149,6 +149,7 @@ def _learn(
             mirror=options.mirror,
             executed_action=options.replay_action == "executed",
             correction_penalty=options.correction_penalty,
+            time_cost=options.time_cost,
             reward_scale=options.reward_scale,
         )
         executed = options.replay_action == "executed"

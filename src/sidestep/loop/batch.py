@@ -41,14 +41,14 @@ def _starts(scenario: Scenario, key: PRNGKeyArray, numbers: Int[Array, "batch"])
 
 
 @eqx.filter_jit
-def _refill(shield: Any, slots: Slots, numbers: Int[Array, "batch"], worlds: World) -> Slots:
+def _refill(task: Task, slots: Slots, numbers: Int[Array, "batch"], worlds: World) -> Slots:
     """Begin episode `numbers[i]` in slot i, unless that is negative."""
-    return select(numbers >= 0, Slots(numbers, begin(shield, worlds)), slots)
+    return select(numbers >= 0, Slots(numbers, begin(task.shield, worlds, task.policy)), slots)
 
 
-def _empty_slots(shield: Any, worlds: World, size: int) -> Slots:
+def _empty_slots(task: Task, worlds: World, size: int) -> Slots:
     """Empty slots."""
-    shapes = eqx.filter_eval_shape(begin, shield, worlds)
+    shapes = eqx.filter_eval_shape(begin, task.shield, worlds, task.policy)
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return Slots(jnp.zeros(size, jnp.int32), empty)
 
@@ -101,8 +101,8 @@ class EpisodeBatch:
     The width does not depend on the number of episodes, and free slots are refilled: each width compiles
     separately, which takes longer than ten thousand episodes.
 
-    **Attributes:** `results` per episode: `outcome`, the fields of `Tally` by name, and `distance` (m) from
-    the start to the target; `sums`, the result of `trial.read`, 0 without.
+    **Attributes:** `results` per episode: `outcome` and the fields of `Tally` by name; `sums`, the result of
+    `trial.read`, 0 without.
     """
 
     def __init__(self, trial: Trial, begin: int, end: int):
@@ -135,10 +135,8 @@ class EpisodeBatch:
         fresh = np.full(trial.width, RUNNING, np.int32)
         fresh[free] = np.arange(self._next, self._next + len(free))
         worlds = _starts(trial.task.scenario, trial.key, jnp.asarray(np.maximum(fresh, 0)))
-        slots = self._slots or _empty_slots(trial.task.shield, worlds, trial.width)
-        self._slots = _refill(trial.task.shield, slots, jnp.asarray(fresh), worlds)
-        way = np.asarray(worlds.target - worlds.evader)[:, free]
-        self._keep("distance", np.hypot(*way), fresh[free])
+        slots = self._slots or _empty_slots(trial.task, worlds, trial.width)
+        self._slots = _refill(trial.task, slots, jnp.asarray(fresh), worlds)
         self._numbers[free] = fresh[free]
         self._next += len(free)
 

@@ -7,15 +7,17 @@ in what they read of each period.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arrays import AnyArray, Lanes, select
+from sidestep._arrays import AnyArray, Lanes, length, select
 from sidestep.loop.step import RUNNING, control_step, decide, decision_steps_of, outcome_of
 from sidestep.pursuit import without_answer
 from sidestep.safety import ShieldResult, Status, start_in_lanes
@@ -40,15 +42,30 @@ class Task(eqx.Module):
         return decision_steps_of(self.policy)
 
 
+class EpisodePolicy(eqx.Module):
+    """A policy that is asked with the task and the episode, not with an observation. So it knows what no
+    robot knows, such as the pursuer's strategy, and it may keep a plan between decisions."""
+
+    @abc.abstractmethod
+    def init(self, world: World) -> Any:
+        """The plan (a pytree) at the start of an episode in `world`, or in each of many worlds in lanes."""
+
+    @abc.abstractmethod
+    def __call__(self, task: Task, episode: Episode) -> Episode:
+        """The episode with a new nominal velocity, and a new plan."""
+
+
 class Tally(eqx.Module):
     """Sums over an episode so far.
 
-    **Attributes:** `total_reward`; `steps`, control periods; the least clearances (m); the number of periods
-    in which the shield corrected the action (`interventions`), could not satisfy its rows (`infeasible`), got
-    non-finite input (`invalid`), and in which a pursuer's wheel speeds were not finite (`pursuer_invalid`);
-    the sum and the maximum of |action - nominal| (m/s).
+    **Attributes:** the `distance` (m) from the start to the target; `total_reward`; `steps`, control periods;
+    the least clearances (m); the number of periods in which the shield corrected the action
+    (`interventions`), could not satisfy its rows (`infeasible`), got non-finite input (`invalid`), and in
+    which a pursuer's wheel speeds were not finite (`pursuer_invalid`); the sum and the maximum of |action -
+    nominal| (m/s).
     """
 
+    distance: Lanes
     total_reward: Lanes
     steps: Int[Array, "*lanes"]
     pursuer_clearance: Lanes
@@ -65,12 +82,14 @@ class Tally(eqx.Module):
         """The tally before the first period, for one world or for many in lanes."""
         zero = jnp.zeros_like(world.time)
         count, far = jnp.zeros_like(world.time, jnp.int32), jnp.full_like(zero, jnp.inf)
-        return cls(zero, count, far, far, count, count, count, count, zero, zero)
+        distance = length(world.target[0] - world.evader[0], world.target[1] - world.evader[1])
+        return cls(distance, zero, count, far, far, count, count, count, count, zero, zero)
 
     def add(self, events: Events, result: ShieldResult, wheel_speeds: Float[Array, "m 2 *lanes"]) -> Tally:
         """The tally with one more period."""
         count = lambda flags: flags.astype(jnp.int32)  # noqa: E731
         return Tally(
+            distance=self.distance,
             total_reward=self.total_reward + events.reward,
             steps=self.steps + 1,
             pursuer_clearance=jnp.minimum(self.pursuer_clearance, events.pursuer_clearance),
@@ -84,11 +103,19 @@ class Tally(eqx.Module):
         )
 
 
+def straight_times(scenario: Scenario, distances: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Times (s) straight to targets at these distances (m) at full speed, which no policy can beat."""
+    return np.maximum(distances - np.asarray(scenario.reach_distance), 0.0) / np.asarray(
+        scenario.evader_speed
+    )
+
+
 class Episode(eqx.Module):
     """The state of an episode. Once it has ended, it does not change.
 
     **Attributes:** `world`; the shield's `memory`; the `nominal` velocity (m/s, world axes), held until the
-    next decision; `outcome`, `RUNNING` or an index into `store.runs.OUTCOMES`; the `tally`.
+    next decision; `outcome`, `RUNNING` or an index into `store.runs.OUTCOMES`; the `tally`; the `plan` of an
+    `EpisodePolicy`, None with other policies.
     """
 
     world: World
@@ -96,6 +123,7 @@ class Episode(eqx.Module):
     nominal: Float[Array, "2 *lanes"]
     outcome: Int[Array, "*lanes"]
     tally: Tally
+    plan: Any = None
 
     @property
     def running(self) -> Bool[Array, "*lanes"]:
@@ -120,19 +148,21 @@ class Period(NamedTuple):
     running: Bool[Array, "*lanes"]
 
 
-def begin(shield: Any, world: World) -> Episode:
-    """Start an episode in `world`, or in each of many worlds in lanes."""
-    return continued(world, start_in_lanes(shield, world))
+def begin(shield: Any, world: World, policy: Any = None) -> Episode:
+    """Start an episode in `world`, or in each of many worlds in lanes; `policy` if it may keep a plan."""
+    plan = policy.init(world) if isinstance(policy, EpisodePolicy) else None
+    return continued(world, start_in_lanes(shield, world), plan)
 
 
-def continued(world: World, memory: Any) -> Episode:
-    """An episode from `world` on, with the shield's `memory` and an empty tally."""
+def continued(world: World, memory: Any, plan: Any = None) -> Episode:
+    """An episode from `world` on, with the shield's `memory`, an empty tally and a policy's `plan`."""
     return Episode(
         world=world,
         memory=memory,
         nominal=jnp.zeros_like(world.evader),
         outcome=jnp.full_like(world.time, RUNNING, jnp.int32),
         tally=Tally.zero(world),
+        plan=plan,
     )
 
 
@@ -144,13 +174,15 @@ def hold(episode: Episode, nominal: Float[AnyArray, "2 *lanes"]) -> Episode:
 def ask(task: Task, episode: Episode) -> Episode:
     """The episode with a new nominal velocity, from the policy."""
     assert task.policy is not None
+    if isinstance(task.policy, EpisodePolicy):
+        return task.policy(task, episode)
     return hold(episode, decide(task.scenario, task.policy, episode.world))
 
 
 def ask_in_time(task: Task, episode: Episode, count: Int[Array, ""]) -> Episode:
     """`ask` if a decision is due after `count` control periods, for one episode or for all lanes."""
     due = count % task.decision_steps == 0
-    return hold(episode, jax.lax.cond(due, lambda: ask(task, episode).nominal, lambda: episode.nominal))
+    return jax.lax.cond(due, lambda: ask(task, episode), lambda: episode)
 
 
 def advance(task: Task, episode: Episode, key: Any) -> tuple[Episode, Period]:
@@ -174,6 +206,7 @@ def advance(task: Task, episode: Episode, key: Any) -> tuple[Episode, Period]:
         nominal=episode.nominal,
         outcome=outcome_of(events),
         tally=episode.tally.add(events, result, wheel_speeds),
+        plan=episode.plan,
     )
     period = Period(episode.world, world, episode.nominal, result, wheel_speeds, events, running)
     return select(running, moved, episode), period

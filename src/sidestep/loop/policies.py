@@ -13,10 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, real
+from sidestep.loop.episode import EpisodePolicy
+from sidestep.loop.planner import Planner
 from sidestep.loop.step import decision_steps_of
 from sidestep.world import Scenario, goal_seeking, goal_seeking_world, observation_size
 
-GOAL_SEEKING = "goal-seeking"
+GOAL_SEEKING, PLANNER = "goal-seeking", "planner"
 _WRONG_SHAPE = "a policy must answer one observation with an action of shape (2,), not {}"
 
 
@@ -52,19 +54,30 @@ def _host_action(policy: Callable[..., Any], observation: np.ndarray) -> np.ndar
     return action
 
 
-def as_policy(policy: Any, scenario: Scenario) -> Callable[..., Any]:
+def as_policy(policy: Any, scenario: Scenario, *, in_episode: bool = False) -> Callable[..., Any]:
     """A policy `(observation) -> action in [-1, 1]^2` that JAX can trace.
 
-    **Arguments:** `policy` the name `goal-seeking` or any callable. A callable that JAX cannot trace runs on
-    the host, which is slower. So does one that returns something other than a JAX array when traced, because
-    its NumPy random numbers, for example, would be drawn only once.
+    **Arguments:** `policy` the name `goal-seeking` or any callable; with `in_episode` also the name `planner`
+    or an `EpisodePolicy`, for callers that ask with the episode (`ask`), as no robot can. A callable that JAX
+    cannot trace runs on the host, which is slower. So does one that returns something other than a JAX array
+    when traced, because its NumPy random numbers, for example, would be drawn only once.
 
     **Raises** `TypeError` for an object that is not callable, `ValueError` for an unknown name or an answer
     that is not two real numbers, and whatever the policy raises.
     """
+    if isinstance(policy, str) and policy == PLANNER:
+        policy = Planner.of(scenario)
+    if isinstance(policy, EpisodePolicy):
+        if not in_episode:
+            raise ValueError(
+                f"policy {PLANNER}: it knows the pursuer's strategy, so only evaluate and rollout take it"
+            )
+        return policy
     if isinstance(policy, str):
         if policy != GOAL_SEEKING:
-            raise ValueError(f"unknown policy '{policy}'; known: {GOAL_SEEKING}, or give a callable")
+            raise ValueError(
+                f"unknown policy '{policy}'; known: {GOAL_SEEKING}, {PLANNER}, or give a callable"
+            )
         return goal_seeking if scenario.frame == "target" else goal_seeking_world
     if not callable(policy):
         raise TypeError(f"a policy is a callable (observation) -> action in [-1, 1]^2; got {policy!r}")

@@ -94,7 +94,7 @@ def _record(task: Task, world: World, key: PRNGKeyArray, steps: int) -> tuple[In
         episode, entry = period(count, episode)
         return count + 1, episode, jax.tree.map(lambda whole, one: whole.at[count].set(one), record, entry)
 
-    count, episode = jnp.zeros((), jnp.int32), begin(task.shield, world)
+    count, episode = jnp.zeros((), jnp.int32), begin(task.shield, world, task.policy)
     shapes = eqx.filter_eval_shape(period, count, episode)[1]
     record = jax.tree.map(lambda leaf: jnp.zeros((steps, *leaf.shape), leaf.dtype), shapes)
     count, _, record = jax.lax.while_loop(more, store, (count, episode, record))
@@ -127,7 +127,7 @@ def rollout(
     **Raises** as `evaluate`.
     """
     steps = scenario.episode_steps if steps is None else whole_number("steps", steps)
-    policy = as_policy(policy, scenario)
+    policy = as_policy(policy, scenario, in_episode=True)
     shield = as_shield(shield, scenario)
     pursuer = as_pursuer(pursuer)
     start_key, pursuit_key = start_and_pursuit(as_key(key))

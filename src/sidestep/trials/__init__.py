@@ -13,6 +13,7 @@ from sidestep.trials.statistics import (
     zero_event_bound,
 )
 from sidestep.trials.survey import Survey, WorstEpisode, load_survey, save_survey, survey_run, take_survey
+from sidestep.trials.yardsticks import Yardsticks, take_yardsticks
 
 __all__ = [
     "Capture",
@@ -20,6 +21,7 @@ __all__ = [
     "InterventionMap",
     "Survey",
     "WorstEpisode",
+    "Yardsticks",
     "count_causes",
     "evaluate",
     "examine_captures",
@@ -31,6 +33,7 @@ __all__ = [
     "stratified_bootstrap",
     "survey_run",
     "take_survey",
+    "take_yardsticks",
     "wilson_interval",
     "zero_event_bound",
 ]

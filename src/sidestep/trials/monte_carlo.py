@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from typing import Any
 
@@ -12,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 from sidestep._arrays import whole_number
 from sidestep._threads import side_by_side, useful_threads
 from sidestep.loop.batch import EpisodeBatch, Trial
-from sidestep.loop.episode import Task
+from sidestep.loop.episode import Task, straight_times
 from sidestep.loop.keys import as_key
 from sidestep.loop.policies import HostPolicy, as_policy
 from sidestep.loop.step import decision_steps_of
@@ -26,6 +27,15 @@ from sidestep.world import Scenario
 _WHOLE = 16
 """The number of lanes should be a multiple of this; the CPU computes remaining lanes one by one."""
 _LEAST_WIDTH = 2 * _WHOLE
+
+
+Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
+"""Opens a progress display for a labelled part: returns a context manager that yields a callable."""
+
+
+def quiet(label: str) -> AbstractContextManager[Callable[..., None]]:
+    """The `Hook` that shows nothing."""
+    return nullcontext(lambda *_: None)
 
 
 def evaluate(
@@ -49,7 +59,8 @@ def evaluate(
     **Arguments:**
 
     - `policy` any `(observation) -> action in [-1, 1]^2`, in JAX or not, or `"goal-seeking"`; it decides
-      every `policy.decision_steps` control periods (1 if it has no such attribute)
+      every `policy.decision_steps` control periods (1 if it has no such attribute). Or `"planner"`, which
+      knows the pursuer's strategy, see `Planner`
     - `shield` a name or a `Shield`; `pursuer` a name, a `Pursuer` or a callable
       `(scenario, world, key) -> wheel speeds (2,)`
     - `key` a random key or a seed
@@ -63,7 +74,7 @@ def evaluate(
     not finite stands still, which counts as `pursuer_invalid`.
     """
     episodes, batch = whole_number("episodes", episodes), whole_number("batch", batch, most=2**20)
-    policy, pursuer = as_policy(policy, scenario), as_pursuer(pursuer)
+    policy, pursuer = as_policy(policy, scenario, in_episode=True), as_pursuer(pursuer)
     decision_steps_of(policy)
     # Python code on the host runs in one thread at a time.
     on_host = isinstance(policy, HostPolicy) or runs_on_host(pursuer, scenario)
@@ -101,7 +112,6 @@ def _evaluation(
     scenario: Scenario, results: dict[str, np.ndarray], where: InterventionMap | None
 ) -> Evaluation:
     steps, period = results["steps"], np.asarray(scenario.control_period, dtype=float)
-    straight = np.maximum(results["distance"] - np.asarray(scenario.reach_distance), 0.0)
     return Evaluation(
         outcome=results["outcome"],
         returns=results["total_reward"],
@@ -116,6 +126,6 @@ def _evaluation(
         max_correction=results["max_correction"],
         map=where,
         pursuer_invalid=results["pursuer_invalid"],
-        straight_times=straight / np.asarray(scenario.evader_speed),
+        straight_times=straight_times(scenario, results["distance"]),
         time_limit=float(scenario.episode_steps * period),
     )

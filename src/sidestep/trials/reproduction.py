@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from sidestep.safety import Status, make_shield
 from sidestep.store import runs as records
 from sidestep.store.files import json_safe, read_json, write_json
 from sidestep.trials.captures import examine_captures
-from sidestep.trials.monte_carlo import evaluate
+from sidestep.trials.monte_carlo import Hook, evaluate, quiet
 from sidestep.trials.survey import save_survey, take_survey
 from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
@@ -40,9 +39,6 @@ PAPER: dict[str, Any] = {
 
 COMPARED = ("none", "paper", "game", "joint")
 """Shields that are compared unless others are named. A newly registered one is not."""
-
-Hook = Callable[[str], AbstractContextManager[Callable[..., None]]]
-"""Opens a progress display for a labelled part: returns a context manager that yields a callable."""
 
 
 @dataclass(frozen=True)
@@ -100,10 +96,6 @@ def test_scene_of(scenario: Scenario) -> Scenario:
 test_scene_of.__test__ = False  # type: ignore[attr-defined]
 
 
-def _quiet(label: str) -> AbstractContextManager[Callable[..., None]]:
-    return nullcontext(lambda *_: None)
-
-
 def _measured(path: Path, run: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     if not path.exists():
         write_json(path, run())
@@ -141,8 +133,8 @@ def reproduce(
     evaluation_episodes: int = 1000,
     options: TrainingOptions | None = None,
     resume: bool = False,
-    training_progress: Hook = _quiet,
-    count_progress: Hook = _quiet,
+    training_progress: Hook = quiet,
+    count_progress: Hook = quiet,
 ) -> list[ShieldStudy]:
     """Train under each shield, measure the trained and the untrained policy, run the paper's test scene.
 

@@ -10,6 +10,7 @@ from sidestep.views.intervention_figure import intervention_figure
 from sidestep.views.obstacle_figure import obstacle_figure
 from sidestep.views.report import write_report
 from sidestep.views.runs import CAPTURE_FILE, EVALUATION_FILE, SCENE_FILE, Run, load_run
+from sidestep.views.time_figure import time_figure
 from sidestep.views.training_figures import outcome_figure, reward_figure, safety_rows, safety_table
 from sidestep.views.trajectory_figures import scenes_figure, trajectory_figure
 from sidestep.views.twin_figure import twin_figure
@@ -36,6 +37,7 @@ __all__ = [
     "safety_rows",
     "safety_table",
     "scenes_figure",
+    "time_figure",
     "trajectory_figure",
     "twin_figure",
     "write_episode_report",

@@ -30,6 +30,7 @@ from sidestep.views.report_sections import (
 from sidestep.views.report_tables import card, comparison, percent
 from sidestep.views.runs import Run, by_shield, load_run
 from sidestep.views.scene import guarded
+from sidestep.views.time_figure import time_figure
 from sidestep.views.training_figures import (
     PAPER_CONVERGED,
     outcome_figure,
@@ -103,6 +104,7 @@ def _content(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
             groups, {shield: scene for shield, (_, scene) in scenes.items()}, untrained_scenes
         ),
         "reward": _reward(runs, folder),
+        "times": embedded(time_figure(runs, folder / "times")),
         "several_runs": any(len(group) > 1 for group in groups.values()),
         "evaluations": evaluations,
         "untrained": untrained,

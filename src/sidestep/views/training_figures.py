@@ -69,13 +69,9 @@ def _returns(run: Run) -> np.ndarray:
 
 def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, dashes: Any) -> None:
     curves = [_returns(run) for run in group]
-    several = len(group) > 1
-    label += f", {len(group)} seeds" if several else ""
+    draw_means(axes, curves, colour, label, dashes)
     for returns in curves:
         means = moving_mean(returns)
-        if several:
-            episodes = np.arange(1, len(returns) + 1)
-            axes.plot(episodes, means, color=colour, alpha=0.35, linewidth=0.7)
         first, stays = converged_episode(returns), stays_converged_from(returns)
         look: dict[str, Any] = {"marker": "D", "markersize": 5, "linestyle": "none"}
         if first is not None:
@@ -84,8 +80,20 @@ def _draw_returns(axes: Axes, group: Sequence[Run], colour: str, label: str, das
         if stays is not None and stays != first:
             edge = {"color": "white", "markeredgecolor": colour, "markeredgewidth": 1.3}
             axes.plot(stays, means[stays - 1], **look, **edge, zorder=5.1)
-    shortest = min(len(returns) for returns in curves)
-    means = np.stack([moving_mean(returns[:shortest]) for returns in curves])
+
+
+def draw_means(
+    axes: Axes, curves: Sequence[np.ndarray], colour: str, label: str, dashes: Any = "solid"
+) -> None:
+    """Draw the moving mean of a curve per seed (thin), their interquartile mean (thick) and their range."""
+    several = len(curves) > 1
+    label += f", {len(curves)} seeds" if several else ""
+    if several:
+        for values in curves:
+            episodes = np.arange(1, len(values) + 1)
+            axes.plot(episodes, moving_mean(values), color=colour, alpha=0.35, linewidth=0.7)
+    shortest = min(len(values) for values in curves)
+    means = np.stack([moving_mean(values[:shortest]) for values in curves])
     episodes = np.arange(1, shortest + 1)
     middle = np.array([interquartile_mean(column) for column in means.T])
     axes.plot(
