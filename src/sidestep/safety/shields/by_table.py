@@ -79,9 +79,9 @@ class TableShield(Shield):
     promises as much while no two matter at once. An evader that is stuck behind an obstacle goes round it,
     see `going_round`.
 
-    **Otherwise.** Where no velocity keeps both margins, and where a second obstacle or pursuer is within
-    `near` (m) of contact, the shield `otherwise` decides if there is one. `make_shield` gives a look-ahead
-    for several obstacles or pursuers, and for tables that are not for ever.
+    **Otherwise.** Where that leaves no margin towards obstacles, and where a second obstacle or pursuer is
+    within `near` (m) of contact, the shield `otherwise` decides if there is one. `make_shield` gives a
+    look-ahead for several obstacles or pursuers, with a budget, and for tables that are not for ever.
 
     **Arguments:** `budget` is kept beside what is to spare, and a tracking error e costs e T more in every
     period; `acceleration` m/s^2: in the period the evader changes its velocity, `world.evader_velocity`, no
@@ -124,7 +124,8 @@ class TableShield(Shield):
     def filter_by_rows(
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
-        return self._by_table(world, jnp.asarray(nominal, world.evader.dtype), memory)
+        result, after, _ = self._by_table(world, jnp.asarray(nominal, world.evader.dtype), memory)
+        return result, after
 
     def init(self, world: World) -> TableMemory:
         otherwise = None if self.otherwise is None else self.otherwise.init(world)
@@ -145,9 +146,9 @@ class TableShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
         nominal = jnp.asarray(nominal, world.evader.dtype)
-        answer = self._by_table(world, nominal, memory)
+        *answer, kept = self._by_table(world, nominal, memory)
         if self.otherwise is None:
-            return answer
+            return answer[0], answer[1]
         arrays, fixed = eqx.partition(self.otherwise, eqx.is_array)
         # It begins anew each time.
         waiting = eqx.tree_at(lambda part: part[1].otherwise, answer, self.otherwise.init(world))
@@ -157,8 +158,7 @@ class TableShield(Shield):
             return result, TableMemory(jnp.zeros_like(memory.turn), after)
 
         inputs = jax.lax.stop_gradient((arrays, world, nominal, memory))
-        gives_up = self._is_crowded(world) | (answer[0].status == Status.INFEASIBLE)
-        gives_up &= answer[0].status != Status.INVALID
+        gives_up = (self._is_crowded(world) | ~kept) & (answer[0].status != Status.INVALID)
         result, after = masked_cond(ask, gives_up, jax.lax.stop_gradient(waiting), *inputs, width=4)
         action = jnp.where(gives_up, result.action, answer[0].action)
         return eqx.tree_at(lambda result: result.action, result, action), after
@@ -171,19 +171,24 @@ class TableShield(Shield):
 
     def _by_table(
         self, world: World, nominal: Float[Array, "2"], memory: TableMemory
-    ) -> tuple[ShieldResult, TableMemory]:
+    ) -> tuple[ShieldResult, TableMemory, Flag]:
+        """The answer, the next memory, and whether it keeps the margin towards obstacles."""
         if not self.scenario.obstacle_count:
-            return self._filtered(world, nominal, nominal), memory
+            result, kept = self._filtered(world, nominal, nominal)
+            return result, memory, kept
         kept = with_margins(self.scenario, self.budget)
         turn = still_turned(kept, world, nominal, memory.turn)
-        result = self._filtered(world, turned(nominal, turn), nominal)
+        result, kept_free = self._filtered(world, turned(nominal, turn), nominal)
         towards_pursuers = result.barriers[: self.scenario.pursuer_count]
         turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
         turn = jnp.where(result.status == Status.INVALID, 0.0, turn)
-        return result, TableMemory(turn.astype(memory.turn.dtype), memory.otherwise)
+        return result, TableMemory(turn.astype(memory.turn.dtype), memory.otherwise), kept_free
 
-    def _filtered(self, world: World, wanted: Float[Array, "2"], nominal: Float[Array, "2"]) -> ShieldResult:
-        """The answer to `nominal`, in place of which `wanted` is tried."""
+    def _filtered(
+        self, world: World, wanted: Float[Array, "2"], nominal: Float[Array, "2"]
+    ) -> tuple[ShieldResult, Flag]:
+        """The answer to `nominal`, in place of which `wanted` is tried, and whether it keeps the margin
+        towards obstacles."""
         scenario, finite = self.scenario, jnp.all(jnp.isfinite(nominal))
         known = known_parts(world)
         everything = jnp.all(known)
@@ -220,13 +225,14 @@ class TableShield(Shield):
         )
         status = jnp.where(everything & finite, status, Status.INVALID)
         barriers = jnp.concatenate([now.towards_pursuers, now.towards_obstacles])
-        return ShieldResult(
+        result = ShieldResult(
             action=action,
             status=status.astype(limited.status.dtype),
             barriers=jnp.where(known, barriers, -jnp.inf),
             slack=jnp.min(margin - aim) / scenario.control_period,
             intervention=correction(action, jnp.where(finite, nominal, 0.0)),
         )
+        return result, margin[1] >= 0.0
 
     def _choose(
         self, world: World, first: Float[Array, "2"], aim: Float[Array, "2"]
