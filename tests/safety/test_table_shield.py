@@ -40,7 +40,8 @@ def test_joint_takes_the_table_where_one_is_shipped_and_looks_ahead_elsewhere():
     assert isinstance(make_shield("joint:look-ahead", SCENARIO), JointShield)
     assert isinstance(make_shield("joint:table", SCENARIO), TableShield)
     assert SHIELD.otherwise is None
-    assert isinstance(make_shield("joint", SCENARIO, Budget(position_error=0.001)).otherwise, JointShield)
+    # On robots with errors and slow motors looking ahead was safer.
+    assert isinstance(make_shield("joint", SCENARIO, Budget(position_error=0.001)), JointShield)
     assert not SHIELD.looks_ahead
     # A table for some seconds leaves what it cannot keep to the look-ahead.
     paper = make_shield("joint", load_scenario("paper"))

@@ -26,7 +26,7 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
     groups = by_shield(runs)
     longest = max((len(run.metrics) for run in runs), default=1)
     with style.house_style():
-        figure = style.new_figure(style.WIDTH, 2.6)
+        figure = style.new_figure(style.WIDTH, 2.9)
         axes = figure.subplots()
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = style.shield_colour(shield, position), style.shield_words(shield)
@@ -64,7 +64,7 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
             "goal-seeking": style.mark("white", 4.5, style.INK, 1.2),
         }
         handles += [Line2D([], [], marker="o", label=label, **look) for label, look in ends.items()]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
         return style.save(figure, path)
 
 

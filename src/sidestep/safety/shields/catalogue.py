@@ -48,13 +48,13 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     `PURSUIT_SHIELDS` only.
 
     For custom robots (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`. `joint` decides by the
-    clearance table that comes with sidestep for this scenario, if there is one, otherwise by looking ahead.
-    `joint:table` takes that table or the one that `clearance_table` keeps, and solves for it, which takes
+    clearance table that comes with sidestep for this scenario, if there is one and no budget is asked for,
+    otherwise by looking ahead. `joint:table` takes that table or the one that `clearance_table` keeps, and solves for it, which takes
     minutes, where there is neither; it never looks ahead.
 
     **Raises** `ValueError` naming the known shields, or what is wrong with the budget, or why there is no
-    table. **Warns** `BudgetWarning` where the budget exceeds what the game allows, `ModelWarning` where custom robots leave an
-    evader that can be captured.
+    table. **Warns** `BudgetWarning` where the budget exceeds what the game allows, `ModelWarning` where
+    custom robots leave an evader that can be captured.
     """
     if name not in SHIELDS | JOINT_FORMS:
         raise ValueError(f"no shield {name!r}; use one of {', '.join(map(repr, SHIELDS | JOINT_FORMS))}")
@@ -74,15 +74,14 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         budget.announce(scenario)
     if name == "game":
         return GameShield(scenario, budget, goes_round=True)
-    if name == "joint" and not traced(scenario):
+    # Within a budget a table promises nothing, and on the physics twin it was less safe than to look ahead.
+    if name == "joint" and budget is None and not traced(scenario):
         table = shipped_table(scenario)
         if table is not None:
-            # Where two obstacles or pursuers matter at once, after its time, and within a budget, a table
-            # promises nothing.
+            # Where two obstacles or pursuers matter at once, or after its time, a table promises nothing.
             several = scenario.obstacle_count > 1 or scenario.pursuer_count > 1
-            decided = table.periods is None and not several and budget is None
-            look_ahead = None if decided else JointShield(scenario, budget=budget)
-            return TableShield(scenario, table, budget=budget, otherwise=look_ahead)
+            decided = table.periods is None and not several
+            return TableShield(scenario, table, otherwise=None if decided else JointShield(scenario))
     if name == "joint:table":
         return TableShield(scenario, table_for(scenario), budget=budget)
     kind: Any = (SHIELDS | JOINT_FORMS)[name]
