@@ -37,7 +37,7 @@ def test_paper_shield_loses_by_what_its_row_takes_for_granted(chase):
     assert judge(PAPER, "paper", across).assumption == "straight"
 
 
-@pytest.mark.parametrize("shield", ["game", "joint"])
+@pytest.mark.parametrize("shield", ["game", "joint:look-ahead"])
 def test_shallow_capture_is_put_down_to_sampling(chase, shield):
     verdict = judge(PAPER, shield, with_depth(chase(), -1e-4))
     assert verdict.assumption == "sampling"
@@ -136,12 +136,23 @@ def test_numbers_that_are_not_finite_are_named(chase):
     assert judge(PAPER, "game", eqx.tree_at(lambda t: t.status, lost, status)).assumption == "finite"
 
 
-@pytest.mark.parametrize("shield", ["paper", "game", "joint"])
+@pytest.mark.parametrize("shield", ["paper", "game", "joint:look-ahead"])
 def test_collision_is_excused_only_where_the_rows_could_not_all_hold(chase, shield):
     assert judge(PAPER, shield, collision(chase(), infeasible=True)).assumption == "alone"
     assert judge(PAPER, shield, collision(chase(), infeasible=False)).inside
     touched = collision(chase(), infeasible=False, depth=1e-8)
     assert judge(PAPER, shield, touched).assumption == "rounding"
+
+
+def test_a_table_for_some_seconds_answers_for_no_more_than_it_says(chase):
+    """That of `paper` keeps 2.1 mm less than the capture distance, for 4 s at a time."""
+    verdict = judge(PAPER, "joint", with_depth(chase(), -1e-4))
+    assert verdict.assumption == "sampling"
+    assert "2.12 mm cannot be ruled out" in verdict.words
+    assert judge(PAPER, "joint", with_depth(chase(), -4e-3)).assumption == "in-time"
+    verdict = judge(PAPER, "joint", collision(chase(), infeasible=False))
+    assert verdict.assumption == "in-time"
+    assert "is for 4 s at a time" in verdict.words
 
 
 def test_obstacle_faster_than_the_evader_is_named(chase):

@@ -49,8 +49,8 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
 
     For custom robots (`EvaderModel`, `PursuerModel`) it is an `AdaptedShield`. `joint` decides by the
     clearance table that comes with sidestep for this scenario, if there is one and no budget is asked for,
-    otherwise by looking ahead. `joint:table` takes that table or the one that `clearance_table` keeps, and solves for it, which takes
-    minutes, where there is neither; it never looks ahead.
+    otherwise by looking ahead. `joint:table` takes that table or the one that `clearance_table` keeps, and
+    solves for it, which takes minutes, where there is neither; it never looks ahead.
 
     **Raises** `ValueError` naming the known shields, or what is wrong with the budget, or why there is no
     table. **Warns** `BudgetWarning` where the budget exceeds what the game allows, `ModelWarning` where

@@ -159,7 +159,7 @@ def _judge_collision(scenario: Scenario, shield: str, trajectory: Trajectory) ->
     if len(stuck):
         since = float(stuck[0]) * float(scenario.control_period)
         words = f"from {since:.2f} s on not all rows could be kept"
-        if shield == "joint":
+        if shield.startswith("joint"):
             words += "; what `joint` adds to them is measured, not proved"
         return Verdict("alone", words)
     return Verdict(None, "all rows could be kept all the time, and still it collided")
