@@ -146,9 +146,10 @@ class TableShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
         nominal = jnp.asarray(nominal, world.evader.dtype)
-        *answer, kept = self._by_table(world, nominal, memory)
+        result, after, kept = self._by_table(world, nominal, memory)
+        answer = result, after
         if self.otherwise is None:
-            return answer[0], answer[1]
+            return answer
         arrays, fixed = eqx.partition(self.otherwise, eqx.is_array)
         # It begins anew each time.
         waiting = eqx.tree_at(lambda part: part[1].otherwise, answer, self.otherwise.init(world))
