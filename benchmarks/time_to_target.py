@@ -17,25 +17,22 @@ from typing import Any
 import jax.numpy as jnp
 
 import study_blocks
+from attack_pursuers import pursuer_named
 from machine import machine, versions
 from sidestep.commands.common import policy_and_scenario
-from sidestep.pursuit import PURSUERS, make_pursuer
+from sidestep.pursuit import PURSUERS
 from sidestep.store.files import write_json
 from sidestep.trials import take_yardsticks
-from sidestep.trials.falsification.attackers import herder, sideswiper
+from sidestep.trials.falsification.attackers import herder
 from sidestep.trials.yardsticks import time_figures
 
 HELD_OUT = ("chauffeur", "herder", "sideswiper")
 LIMIT = 120.0
 
 
-def pursuer_named(name: str) -> Any:
-    """A built-in pursuer, or one of the falsifier's."""
-    if name == "herder":
-        return herder((jnp.asarray(True), jnp.asarray(0.6)))
-    if name == "sideswiper":
-        return sideswiper((jnp.asarray(0.6), jnp.asarray(0.3)))
-    return make_pursuer(name)
+def pursuer(name: str) -> Any:
+    """A built-in pursuer, or an attacking one; the herder herds towards the target."""
+    return herder((jnp.asarray(True), jnp.asarray(0.6))) if name == "herder" else pursuer_named(name)
 
 
 def main() -> int:
@@ -63,7 +60,7 @@ def main() -> int:
             continue
         begun = time.perf_counter()
         yardsticks = take_yardsticks(
-            scenario, policy, arguments.shield, pursuer_named(name), arguments.episodes, arguments.seed,
+            scenario, policy, arguments.shield, pursuer(name), arguments.episodes, arguments.seed,
             planner=arguments.planner,
         )  # fmt: skip
         study["pursuers"][name] = {

@@ -62,9 +62,7 @@ class ClearanceGame:
         """
         scenario.check_built_in("a clearance table", "there is none for other robots")
         wanted = float(scenario.capture_distance)
-        level = wanted if angle is not None or not nearest else _kept(scenario)
-        if angle is None:
-            angle = _best_angle(scenario, level)
+        level, angle = (wanted, angle) if angle is not None else _design(scenario, nearest)
         drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
         return ClearanceGame(
             evader_speed=float(scenario.evader_speed),
@@ -145,33 +143,24 @@ _BELOW = 0.998
 """Share of the largest distance that it can keep: the design angle then has some slack."""
 
 
-def _sampled(scenario: Scenario) -> SampledGame:
-    return SampledGame(
+def _design(scenario: Scenario, nearest: bool) -> tuple[float, float]:
+    """The capture distance (m) and the angle (rad) of `ClearanceGame.of`."""
+    game = SampledGame(
         float(scenario.evader_speed),
         float(scenario.pursuer_speed),
         float(scenario.pursuer_half_axle),
         float(scenario.control_period),
     )
-
-
-def _kept(scenario: Scenario) -> float:
-    """The capture distance (m), or the largest that the evader can keep for ever if that is nearly as
-    much."""
-    game, wanted = _sampled(scenario), float(scenario.capture_distance)
-    if best_angle(game, wanted, COARSE)[1] >= 0.0:
-        return wanted
-    level = _BELOW * largest_true(
-        lambda level: best_angle(game, level, COARSE)[1], _NEARLY * wanted, wanted, 1e-4 * wanted
-    )
-    return level if best_angle(game, level, COARSE)[1] >= 0.0 else wanted
-
-
-def _best_angle(scenario: Scenario, level: float) -> float:
-    game = _sampled(scenario)
+    level = wanted = float(scenario.capture_distance)
     widest, slack = best_angle(game, level, COARSE)
+    if nearest and not slack >= 0.0:
+        level = _BELOW * largest_true(
+            lambda level: best_angle(game, level, COARSE)[1], _NEARLY * wanted, wanted, 1e-4 * wanted
+        )
+        widest, slack = best_angle(game, level, COARSE)
     if not slack >= 0.0:
         raise ValueError(
-            f"no design angle keeps the pursuer {level:g} m away at a period of {game.control_period:g} s "
+            f"no design angle keeps the pursuer {wanted:g} m away at a period of {game.control_period:g} s "
             "for ever, so there is no clearance table; `sidestep certify` shows what would do"
         )
-    return game.usable_angle + 0.25 * (widest - game.usable_angle)
+    return level, game.usable_angle + 0.25 * (widest - game.usable_angle)
