@@ -225,3 +225,10 @@ def test_time_marks_are_few_and_inside_the_episode(duration):
     marks = mark_periods(duration, 0.05)
     assert len(marks) <= 17
     assert all(0 < mark <= round(duration / 0.05) for mark in marks)
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_time_figure_of_short_runs_of_several_seeds(tmp_path, count, run_of):
+    runs = [run_of("none", ("reached",) * count, seed) for seed in range(3)]
+    assert_fine(time_figure(runs, tmp_path / "t"))
+    assert_fine(time_figure([replace(run, evaluation=None, untrained_evaluation=None) for run in runs], tmp_path / "t"))

@@ -28,6 +28,7 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
     with style.house_style():
         figure = style.new_figure(style.WIDTH, 2.9)
         axes = figure.subplots()
+        axes.set_yscale("log")  # first: matplotlib refuses it later where runs are too short for a mean
         for position, (shield, group) in enumerate(groups.items()):
             colour, words = style.shield_colour(shield, position), style.shield_words(shield)
             draw_means(axes, [_times(run) for run in group], colour, words, style.shield_dashes(shield))
@@ -51,7 +52,6 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
             shortest = min(len(times) for times in straight)
             means = np.mean([times[:shortest] for times in straight], axis=0)
             draw_means(axes, [means], style.FAINT, "straight there, alone")
-        axes.set_yscale("log")
         axes.yaxis.set_major_formatter(ScalarFormatter())
         axes.yaxis.set_minor_formatter(NullFormatter())
         style.light_grid(axes, "y")
