@@ -54,9 +54,11 @@ def test_reward_figure_of_many_seeds_of_different_length(tmp_path, run_of):
     assert_fine(reward_figure(runs, tmp_path / "reward.png"))
 
 
-@pytest.mark.parametrize("count", [0, 19, 60])
-def test_time_figure_of_a_run_of_any_length(tmp_path, count, run_of):
-    assert_fine(time_figure([run_of(outcomes=("reached", "captured", "timed_out") * count)], tmp_path / "t"))
+@pytest.mark.parametrize("count", [0, 1, 19, 60])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_time_figure_of_runs_of_any_length(tmp_path, count, seeds, run_of):
+    outcomes = ("reached", "captured", "timed_out") * count
+    assert_fine(time_figure([run_of("none", outcomes, seed) for seed in range(seeds)], tmp_path / "t"))
 
 
 def test_time_figure_counts_every_episode_that_did_not_arrive_as_the_limit(run_of, drawn):
@@ -225,10 +227,3 @@ def test_time_marks_are_few_and_inside_the_episode(duration):
     marks = mark_periods(duration, 0.05)
     assert len(marks) <= 17
     assert all(0 < mark <= round(duration / 0.05) for mark in marks)
-
-
-@pytest.mark.parametrize("count", [1, 4])
-def test_time_figure_of_short_runs_of_several_seeds(tmp_path, count, run_of):
-    runs = [run_of("none", ("reached",) * count, seed) for seed in range(3)]
-    assert_fine(time_figure(runs, tmp_path / "t"))
-    assert_fine(time_figure([replace(run, evaluation=None, untrained_evaluation=None) for run in runs], tmp_path / "t"))
