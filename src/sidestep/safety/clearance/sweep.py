@@ -39,6 +39,23 @@ def _cell(angles, angle):
 
 @njit(cache=True, fastmath=True)
 @no_type_check
+def _cell_from(angles, node, past):
+    """The same for the angle `past` (rad, of any sign) that of a node."""
+    count = len(angles)
+    width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+    while past >= width:
+        past -= width
+        node = node + 1 if node + 1 < count else 0
+        width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+    while past < 0.0:
+        node = node - 1 if node > 0 else count - 1
+        width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+        past += width
+    return node, past, width
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
 def _mixed(table, low, strides, up, along, row):
     """The table's row between the four nodes of a cell, and its first entry once more."""
     count, one = table.shape[1], np.float32(1.0)
@@ -60,14 +77,7 @@ def _rotated(row, angles, sign, start, least):
     for k in range(count):
         if k > 0:
             past += sign * (angles[k] - angles[k - 1])
-        while past >= width:
-            past -= width
-            node = node + 1 if node + 1 < count else 0
-            width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
-        while past < 0.0:
-            node = node - 1 if node > 0 else count - 1
-            width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
-            past += width
+        node, past, width = _cell_from(angles, node, past)
         value = row[node] + np.float32(past / width) * (row[node + 1] - row[node])
         least[k] = max(least[k], value)
 
@@ -88,15 +98,7 @@ def _grown(row, angles, drift, spare, grown):
         for way in (-1, 1):
             node, past = k, 0.0
             for _ in range(_PARTS):
-                past += way * step
-                width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
-                if past >= width:
-                    past -= width
-                    node = node + 1 if node + 1 < count else 0
-                elif past < 0.0:
-                    node = node - 1 if node > 0 else count - 1
-                    past += (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
-                width = (angles[node + 1] if node + 1 < count else math.pi) - angles[node]
+                node, past, width = _cell_from(angles, node, past + way * step)
                 radius = row[node] + past / width * (row[node + 1 if node + 1 < count else 0] - row[node])
                 turn = angles[node] + past - angles[k]
                 turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
