@@ -109,10 +109,10 @@ def _judge_table(scenario: Scenario, table: ClearanceTable, trajectory: Trajecto
     start: World = jax.tree.map(lambda leaf: leaf[0], trajectory.worlds)
     if scenario.pursuer_count != 1:
         return Verdict("one-pursuer", f"there are {scenario.pursuer_count} pursuers")
-    clearance = float(np.min(np.asarray(trajectory.events.pursuer_clearance)))
-    if trajectory.outcome == "captured" and clearance >= -table.game.shortfall - _exact(trajectory):
-        words = f"caught {-1e3 * clearance:.3g} mm deep; at this control period "
-        return Verdict("sampling", f"{words}{1e3 * table.game.shortfall:.3g} mm cannot be ruled out")
+    if trajectory.outcome == "captured":
+        verdict = _judge_capture(scenario, trajectory, guaranteed=-table.game.shortfall)
+        if verdict.assumption is not None:
+            return verdict
     margin = float(TableShield(scenario, table).margin(start))
     if margin < 0.0:
         return Verdict(
