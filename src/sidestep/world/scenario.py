@@ -225,7 +225,7 @@ class Scenario(eqx.Module):
         pursuer_clearance = fold(jnp.minimum, to_pursuers, jnp.inf) - self.capture_distance
         obstacle_clearance = fold(jnp.minimum, to_obstacles, jnp.inf) - self.collision_distance
 
-        moved = self.moved(world, velocity, wheels)
+        moved = self._moved_a_period(world, velocity, wheels)
         # In whole periods, as in `moved`.
         periods = jnp.round(moved.time / period)
         captured = pursuer_clearance <= 0.0
@@ -285,9 +285,14 @@ class Scenario(eqx.Module):
         wheel_speeds: Float[Array, "m 2 *lanes"],
     ) -> World:
         """The world one control period later, for commands within the robots' limits."""
+        return self._moved_a_period(self._aimed(world, velocity), velocity, wheel_speeds)
+
+    def _moved_a_period(
+        self, world: World, velocity: Float[Array, "2 *lanes"], wheel_speeds: Float[Array, "m 2 *lanes"]
+    ) -> World:
+        """`moved`, for obstacles that are aimed already."""
         # Counting whole periods keeps the float32 time exact enough for the time limit.
         periods = jnp.round(world.time / self.control_period) + 1.0
-        world = self._aimed(world, velocity)
         there = self._moved(world, velocity, wheel_speeds, self.control_period)
         return eqx.tree_at(
             lambda w: (w.time, w.wheel_speeds), there, (periods * self.control_period, wheel_speeds)
