@@ -296,21 +296,16 @@ class JointShield(Shield):
     def _confirm(self, inputs: _Inputs) -> Flag:
         """Whether the plan stays clear after the action, whichever model drives. For a plan that was not
         clear: whether it still comes to no contact."""
-        now, memory = inputs.world, inputs.memory
-        after = [
-            select(memory.clear, self._stepped(now, inputs.action, wheels), now) for wheels in inputs.wheels
-        ]
-        worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1)[..., None], *after)
+        now, memory, count = inputs.world, inputs.memory, len(self.models)
+        lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, count)), now)
+        action = jnp.broadcast_to(inputs.action[:, None], (2, count))
+        after = moved(self.scenario, lanes, action, jnp.moveaxis(inputs.wheels, 0, -1), self.acceleration)
+        worlds = jax.tree.map(lambda leaf: leaf[..., None], select(memory.clear, after, lanes))
         sides = jnp.where(memory.clear, inputs.sides, inputs.held)
         outlook = self._imagine(worlds, sides, memory.plan[None], memory.age[None])
         # Where the action itself leads counts too.
         least = jnp.minimum(jnp.min(outlook.least), jnp.min(clearance(self.scenario, worlds)))
         return jnp.where(memory.clear, least >= self._floor(now), least > 0.0)
-
-    def _stepped(self, world: World, action: Float[Array, "2"], wheels: Float[Array, "m 2"]) -> World:
-        if self.acceleration is None:
-            return self.scenario.step(world, action, wheels)[0]
-        return moved(self.scenario, world, action, wheels, self.acceleration)
 
     def _floor(self, world: World) -> Scalar:
         """Clearance (m) that a clear plan keeps: margin and budget, or what there is now if that is less."""

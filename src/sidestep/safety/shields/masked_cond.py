@@ -27,6 +27,7 @@ def masked_cond(
     values, build_values = jax.tree.flatten(arguments)
     defaults, build_result = jax.tree.flatten(otherwise)
 
+    @jax.jit  # so that it is traced once, though it is used alone and in batches
     def run(*values: Any) -> list[Any]:
         return jax.tree.leaves(function(*jax.tree.unflatten(build_values, values)))
 
