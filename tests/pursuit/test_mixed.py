@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sidestep._arrays import real
-from sidestep.pursuit import make_pursuer
+from sidestep.pursuit import PURSUERS, make_pursuer
 from sidestep.pursuit.mixed import Mixed
 from sidestep.pursuit.pursuers import Pursuer, Random, TurnThenDrive
 from sidestep.world import World, load_scenario
@@ -94,6 +94,20 @@ def test_one_strategy_at_full_effort_is_that_strategy():
     world = SCENARIO.reset(jax.random.key(4))
     mixed = Mixed((TurnThenDrive(),), least_effort=1.0, least_agility=1.0)
     assert np.array_equal(mixed(SCENARIO, world, KEY), TurnThenDrive()(SCENARIO, world, KEY))
+
+
+def test_erratic_part_draws_each_wheel_uniformly_and_anew_in_every_period():
+    mixed = make_pursuer("mixed")
+    assert len(mixed.strategies) == len(PURSUERS)
+    times = 0.05 * np.arange(4000)
+    one = Mixed((mixed.strategies[list(PURSUERS).index("random")],))
+    shares = drawn(one, np.tile([[0.3, -0.7]], (4000, 1)), times) / float(SCENARIO.pursuer_speed)
+    assert np.all(np.abs(shares) <= 1.0)
+    # A uniform variable on [-1, 1] has the variance 1/3; four standard errors.
+    assert np.abs(shares.mean(axis=0)).max() < 4 * np.sqrt(1 / 3 / 4000)
+    assert np.allclose(shares.var(axis=0), 1 / 3, atol=4 * np.sqrt(4 / 45 / 4000))
+    for first, second in ((shares[:, 0], shares[:, 1]), (shares[1:, 0], shares[:-1, 0])):
+        assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(4000)
 
 
 def test_strategy_that_needs_a_key_of_its_own_is_refused():

@@ -7,6 +7,7 @@ from typing import final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt
 
 from sidestep._arrays import Lanes, Scalar, real, stack
@@ -15,15 +16,32 @@ from sidestep.pursuit.pursuers import (
     Nash,
     PurePursuit,
     Pursuer,
+    Still,
     TurnThenDrive,
     TurnWhileDriving,
 )
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
+_STEP = np.uint32(0x9E3779B9)
+"""Between words to be hashed one after another: 2^32 divided by the golden ratio."""
+
+
+@final
+class _Erratic(Pursuer):
+    """`Random` in lanes: wheel speeds from hash values of target and time, anew in each control period."""
+
+    takes_lanes = True
+    always_finite = True
+
+    def steer(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2 *lanes"]:
+        left = _hashed(_episode(world) ^ _bits(world.time))
+        drawn = stack(_share(left), _share(_hashed(left + _STEP)))
+        return scenario.pursuer_speed * (2.0 * drawn - 1.0)
+
 
 def _strategies() -> tuple[Pursuer, ...]:
-    return (Nash(), TurnThenDrive(), TurnWhileDriving(), PurePursuit(), Interceptor())
+    return (Nash(), TurnThenDrive(), TurnWhileDriving(), PurePursuit(), Interceptor(), _Erratic(), Still())
 
 
 @final
@@ -35,9 +53,9 @@ class Mixed(Pursuer):
     those of the strategy in one control period, from `least_agility` to 1. A share `full` of the stretches
     has effort 1, and one agility 1; by default all have. Stretches begin at an offset of the episode's own.
 
-    A strategy keeps no state, so the draws are hash values of the target, which is constant in an episode,
-    and of the stretch: episodes with equal targets get equal sequences. With one strategy, effort and agility
-    1 it is that strategy.
+    The strategies are all the built-in ones. A strategy keeps no state, so the draws are hash values of the
+    target, which is constant in an episode, and of the stretch: episodes with equal targets get equal
+    sequences. With one strategy, effort and agility 1 it is that strategy.
     """
 
     strategies: tuple[Pursuer, ...] = eqx.field(default_factory=_strategies)
@@ -54,12 +72,12 @@ class Mixed(Pursuer):
         for strategy in self.strategies:
             if not strategy.takes_lanes:
                 raise ValueError(f"a mixture takes strategies with takes_lanes, not {strategy!r}")
-        episode = _hashed(_bits(world.target[0]) ^ _hashed(_bits(world.target[1])))
+        episode = _episode(world)
         stretch = jnp.floor(world.time / self.hold + _share(_hashed(episode))).astype(jnp.uint32)
-        seed = _hashed(episode + stretch * jnp.uint32(0x9E3779B9))
+        seed = _hashed(episode + stretch * _STEP)
         drawn = []
         for _ in range(5):
-            seed = _hashed(seed + jnp.uint32(0x9E3779B9))
+            seed = _hashed(seed + _STEP)
             drawn.append(_share(seed))
         number = jnp.floor(drawn[0] * len(self.strategies)).astype(jnp.int32)
 
@@ -78,6 +96,11 @@ class Mixed(Pursuer):
                 for before, wheel in zip(world.wheel_speeds[0], wheels, strict=True)
             )
         )
+
+
+def _episode(world: World) -> UInt[Array, "*lanes"]:
+    """A word of the episode's own."""
+    return _hashed(_bits(world.target[0]) ^ _hashed(_bits(world.target[1])))
 
 
 def _bits(number: Float[Array, "*lanes"]) -> UInt[Array, "*lanes"]:
