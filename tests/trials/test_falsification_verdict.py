@@ -149,6 +149,7 @@ def test_a_table_for_some_seconds_answers_for_no_more_than_it_says(chase):
     verdict = judge(PAPER, "joint", with_depth(chase(), -1e-4))
     assert verdict.assumption == "sampling"
     assert "2.12 mm cannot be ruled out" in verdict.words
+    assert judge(PAPER, "joint", with_depth(chase(), -1e-7)).assumption == "rounding"
     assert judge(PAPER, "joint", with_depth(chase(), -4e-3)).assumption == "in-time"
     verdict = judge(PAPER, "joint", collision(chase(), infeasible=False))
     assert verdict.assumption == "in-time"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -282,18 +283,13 @@ class TableShield(Shield):
     def _margins(self, world: World) -> _Margins:
         """h' less what is to spare towards each pursuer, and for each obstacle the least |p| - R, less the
         same, over all pursuers."""
-        towards_obstacles = self._alone(world, jnp.zeros_like(world.evader))
-        to_pursuers, to_obstacles = self._spares
-        heights = []
-        for pose in world.pursuers:
-            z = to_pursuer_frame(world.evader, pose)
-            heights.append(self.table.grid.height(jnp, z[0], z[1]) - to_pursuers)
-            gaps = [
-                norm(p) - self.table(z, to_pursuer_axes(p, pose[2]))[1] - to_obstacles
-                for p in world.evader - world.obstacles[:, :2]
-            ]
-            towards_obstacles = _at_most(towards_obstacles, gaps)
-        return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world))
+        grid = self.table.grid
+        return self._over_pairs(
+            world,
+            self._alone(world, jnp.zeros_like(world.evader)),
+            lambda z, pose: grid.height(jnp, z[0], z[1]),
+            lambda z, p, pose: norm(p) - self.table(z, p)[1],
+        )
 
     def _margin_after(self, world: World, action: Float[Array, "2"]) -> Float[Array, "2"]:
         """The margins (m) a period after `action` (m/s), whatever pursuers and obstacles do."""
@@ -301,21 +297,40 @@ class TableShield(Shield):
         if self.acceleration is not None:
             action, _ = ramp(world.evader_velocity, action, self.acceleration, period)
         move, drift = period * action, period * self._drift
-        towards_obstacles = self._alone(world, move) - drift
-        to_pursuers, to_obstacles = self._spares
-        heights = []
         motions = jnp.asarray(self.table.game.motions(_TURNS, 2), move.dtype)
-        for pose in world.pursuers:
-            z, moved = to_pursuer_frame(world.evader, pose), to_pursuer_axes(move, pose[2])
-            there = jnp.broadcast_to((z + moved)[:, None], (2, len(motions)))
+
+        def height(z: Float[Array, "2"], pose: Float[Array, "3"]) -> Scalar:
+            there = jnp.broadcast_to((z + to_pursuer_axes(move, pose[2]))[:, None], (2, len(motions)))
             seen = to_pursuer_frame(there, motions.T)
-            heights.append(jnp.min(self.table.grid.height(jnp, seen[0], seen[1])) - to_pursuers)
+            return jnp.min(self.table.grid.height(jnp, seen[0], seen[1]))
+
+        return self._over_pairs(
+            world,
+            self._alone(world, move) - drift,
+            height,
+            lambda z, p, pose: self.table.spare_after(z, p, to_pursuer_axes(move, pose[2]), drift),
+        ).least
+
+    def _over_pairs(
+        self,
+        world: World,
+        alone: Float[Array, "k"],
+        height: Callable[..., Scalar],
+        gap: Callable[..., Scalar],
+    ) -> _Margins:
+        """The margins by `height(z, pose)` of each pursuer and the least `gap(z, p, pose)`, at most `alone`,
+        of each obstacle, less what is to spare; z and p in the pursuer's frame."""
+        to_pursuers, to_obstacles = self._spares
+        heights, towards_obstacles = [], alone
+        for pose in world.pursuers:
+            z = to_pursuer_frame(world.evader, pose)
+            heights.append(height(z, pose) - to_pursuers)
             gaps = [
-                self.table.spare_after(z, to_pursuer_axes(p, pose[2]), moved, drift) - to_obstacles
+                gap(z, to_pursuer_axes(p, pose[2]), pose) - to_obstacles
                 for p in world.evader - world.obstacles[:, :2]
             ]
             towards_obstacles = _at_most(towards_obstacles, gaps)
-        return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world)).least
+        return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world))
 
     def _alone(self, world: World, move: Float[Array, "2"]) -> Float[Array, "k"]:
         """What is left to every obstacle by itself, m, after the evader's `move`."""
