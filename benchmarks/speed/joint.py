@@ -19,9 +19,10 @@ MOST_EPISODES = 1000
 
 
 def cases(quick: bool) -> list[Case]:
-    """The shield `joint` in its two forms, and `game` beside it."""
+    """The shield `joint`, its two forms alone, and `game` beside it."""
     amount = {"seconds": 0.2, "decisions": 20} if quick else {"seconds": 20.0, "decisions": 20_000}
     kinds = {
+        "joint shield": ("joint", "paper"),
         "joint shield, looking ahead": ("joint:look-ahead", "paper"),
         "joint shield, by its table": ("joint:table", "paper-0.15"),
         "game shield": ("game", "paper"),
@@ -29,7 +30,7 @@ def cases(quick: bool) -> list[Case]:
     return [
         Case("joint", name, {"shield": shield, "scenario": scenario, **amount, "pursuer": PURSUER}, threads=1)
         for name, (shield, scenario) in kinds.items()
-        if not (quick and shield == "joint:look-ahead")
+        if not (quick and shield in ("joint", "joint:look-ahead"))
     ]
 
 

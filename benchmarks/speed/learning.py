@@ -1,7 +1,7 @@
 """The whole training loop - act, shield, move, store, learn - against three implementations of TD3.
 
 Same task (scenario `paper`, pursuer `turn-then-drive`), two hidden layers of 256 with ReLU, batch 256,
-Adam, one update per environment step. A side runs with one thread and with one per core; its faster run
+Adam, one update per step of all worlds. A side runs with one thread and with one per core; its faster run
 counts.
 """
 
@@ -42,18 +42,21 @@ def cases(quick: bool) -> list[Case]:
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Milliseconds per step of one side, in chunks of steps, for `seconds` after all has compiled."""
+    """Milliseconds per step of one side, in chunks of steps, for `seconds` after all has compiled; `worlds`
+    are stepped at once, one by default."""
     side, chunk, budget = settings["side"], settings["chunk"], settings["seconds"]
+    worlds = settings.get("worlds", 1)
     if side in ("sb3", "sbx"):
-        first, seconds = _stable_baselines(side, chunk, budget)
+        first, seconds = _stable_baselines(side, chunk, budget, worlds)
     else:
-        advance = _rejax(chunk) if side == "rejax" else _ours(side.partition("-")[2], chunk)
+        shield = side.partition("-")[2]
+        advance = _rejax(chunk, worlds) if side == "rejax" else _ours(shield, chunk, worlds)
         _, first = first_call(advance)
-        seconds = durations(lambda _: advance(), budget, least=3, warm_up=-(-WARMUP // chunk))
+        seconds = durations(lambda _: advance(), budget, least=3, warm_up=-(-WARMUP // (chunk * worlds)))
     per_step = [spent / chunk for spent in seconds]
     return {
         "latency": spread(per_step, "ms"),
-        "throughput": {"value": 1.0 / float(np.mean(per_step)), "unit": "steps/s"},
+        "throughput": {"value": worlds / float(np.mean(per_step)), "unit": "steps/s"},
         "compile_seconds": max(0.0, first - chunk * float(np.median(per_step))) if side != "sb3" else 0.0,
     }
 
@@ -73,7 +76,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     return {"steps_per_second": best, "ratios": ratios}
 
 
-def training(shield: str) -> tuple[Callable[[Any, int], Any], Callable[[int], Any]]:
+def training(shield: str, worlds: int = 1) -> tuple[Callable[[Any, int], Any], Callable[[int], Any]]:
     """`advance(state, length) -> state` and `begin(seed) -> state` of our training loop."""
     import jax
     import jax.numpy as jnp
@@ -85,7 +88,12 @@ def training(shield: str) -> tuple[Callable[[Any, int], Any], Callable[[int], An
 
     scenario = load_scenario("paper")
     options = make_options(
-        decision_steps=1, updates_per_decision=1, batch_size=BATCH, hidden=HIDDEN, warmup_decisions=WARMUP
+        decision_steps=1,
+        updates_per_decision=1,
+        batch_size=BATCH,
+        hidden=HIDDEN,
+        warmup_decisions=WARMUP,
+        worlds=worlds,
     )
     guard, pursuer = make_shield(shield, scenario), make_pursuer(PURSUER)
     forever = jnp.asarray(2**30)
@@ -100,8 +108,8 @@ def training(shield: str) -> tuple[Callable[[Any, int], Any], Callable[[int], An
     return advance, begin
 
 
-def _ours(shield: str, chunk: int) -> Callable[[], None]:
-    step, begin = training(shield)
+def _ours(shield: str, chunk: int, worlds: int) -> Callable[[], None]:
+    step, begin = training(shield, worlds)
     state = begin(0)
 
     def advance() -> None:
@@ -111,7 +119,7 @@ def _ours(shield: str, chunk: int) -> Callable[[], None]:
     return advance
 
 
-def _rejax(chunk: int) -> Callable[[], None]:
+def _rejax(chunk: int, worlds: int) -> Callable[[], None]:
     """rejax's `train`, compiled whole as its authors do, `chunk` steps a call, and no evaluation in it."""
     import jax
 
@@ -123,14 +131,14 @@ def _rejax(chunk: int) -> Callable[[], None]:
     algorithm = rejax.get_algo("td3").create(
         env=task.environment,
         env_params=task.environment.default_params,
-        num_envs=1,
+        num_envs=worlds,
         num_epochs=1,
         policy_delay=2,
         batch_size=BATCH,
         buffer_size=BUFFER,
         fill_buffer=WARMUP,
-        total_timesteps=chunk,
-        eval_freq=chunk,
+        total_timesteps=chunk * worlds,
+        eval_freq=chunk * worlds,
         learning_rate=3e-4,
         gamma=0.99,
         polyak=0.995,
@@ -156,25 +164,26 @@ def _rejax(chunk: int) -> Callable[[], None]:
     return advance
 
 
-def _stable_baselines(side: str, chunk: int, budget: float) -> tuple[float, list[float]]:
+def _stable_baselines(side: str, chunk: int, budget: float, worlds: int) -> tuple[float, list[float]]:
     """Seconds of the first chunk after the random steps, and of those after it, told by a callback."""
     from speed.gymnasium_task import make_environment
     from speed.peers import peer
 
     callbacks, noises = peer("stable_baselines3.common.callbacks"), peer("stable_baselines3.common.noise")
+    vectors = peer("stable_baselines3.common.vec_env")
     threads = int(os.environ.get("OMP_NUM_THREADS", cores()))
     peer("torch").set_num_threads(threads)
     times: list[float] = []
 
     class Clock(callbacks.BaseCallback):
         def _on_step(self) -> bool:
-            if self.num_timesteps >= WARMUP and (self.num_timesteps - WARMUP) % chunk == 0:
+            if self.num_timesteps >= WARMUP and (self.num_timesteps - WARMUP) // worlds % chunk == 0:
                 times.append(time.perf_counter())
             return len(times) < 5 or times[-1] - times[1] < budget
 
     model = peer("stable_baselines3" if side == "sb3" else "sbx").TD3(
         "MlpPolicy",
-        make_environment(),
+        vectors.DummyVecEnv([make_environment] * worlds),
         learning_rate=3e-4,
         buffer_size=BUFFER,
         learning_starts=WARMUP,
@@ -183,7 +192,9 @@ def _stable_baselines(side: str, chunk: int, budget: float) -> tuple[float, list
         gamma=0.99,
         train_freq=1,
         gradient_steps=1,
-        action_noise=noises.NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)),
+        action_noise=noises.VectorizedActionNoise(
+            noises.NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)), worlds
+        ),
         policy_delay=2,
         target_policy_noise=0.2,
         target_noise_clip=0.5,

@@ -7,6 +7,7 @@ from typing import Any
 
 SECTIONS = {
     "learning": "the whole training loop against Stable-Baselines3, SBX and rejax",
+    "many_worlds": "the same loop with many worlds at once",
     "filter": "the filter against cbfpy, qpax, OSQP and Clarabel",
     "simulation": "many worlds at once against a loop over a Gymnasium environment",
     "joint": "how long one decision of the shield joint takes",
