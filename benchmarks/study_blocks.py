@@ -1,14 +1,20 @@
 """A study in blocks of episodes: worked on by processes, and continued from what an earlier run wrote."""
 
+import atexit
 import json
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from sidestep._compiled import thread_limits
+from sidestep.store.lock import FolderInUseError, hold_files
+
+_held = ExitStack()
+atexit.register(_held.close)
 
 
 def results(run_block: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterator[Any]:
@@ -27,7 +33,14 @@ def _alone() -> None:
 
 
 def earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """The report to go on with; empty if there is none. Ends the program if its settings were others."""
+    """The report to go on with; empty if there is none. Until the program ends no other can begin one there.
+
+    Ends the program if the report's settings were others, or another program is at work on it.
+    """
+    try:
+        _held.enter_context(hold_files(path.with_name(f".{path.name}.lock")))
+    except FolderInUseError as error:
+        raise SystemExit(f"{path}: another study writes there ({error})") from None
     if not path.exists():
         return {}
     report = json.loads(path.read_text(encoding="utf-8"))
