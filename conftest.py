@@ -53,7 +53,6 @@ OTHER_MACHINES = "needs other machines: a scheduler, SSH hosts or a cluster"
 PYTORCH = "needs PyTorch, which is in no lock"
 ROS = "needs ROS 2; `make test-ros` runs the nodes"
 INDEX = "installs from a package index; `make test-wheel` does the same with every extra"
-LANES = "compiles the look-ahead for 64 worlds, a minute; tests/learning runs a warm start and many worlds"
 LEFT_OUT = {
     ("docs/campaigns.md", "dask scheduler --host"): OTHER_MACHINES,
     ("docs/campaigns.md", "from distributed import SSHCluster"): OTHER_MACHINES,
@@ -61,7 +60,6 @@ LEFT_OUT = {
     ("docs/campaigns.md", "from dask_kubernetes"): OTHER_MACHINES,
     ("docs/gymnasium.md", "python -m pip install torch"): PYTORCH,
     ("docs/gymnasium.md", "from stable_baselines3 import"): PYTORCH,
-    ("docs/learning.md", "sidestep train --out runs/many --warm-start"): LANES,
     ("docs/ros2.md", "colcon build"): ROS,
     ("docs/ros2.md", "make test-ros"): ROS,
     ("docs/ros2.md", ".venv/bin/python ros2/private_network.py"): ROS,

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep.pursuit import PURSUERS, Pursuer, make_pursuer
+from sidestep.pursuit import Pursuer, make_pursuer
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.trials.falsification.attackers import JointSaddle, herder, sideswiper
 from sidestep.world.capture_geometry import to_pursuer_frame
@@ -91,5 +91,5 @@ period allows, and knows the evader's velocity."""
 
 
 def pursuer_named(name: str) -> Any:
-    """A built-in pursuer, or an attacking one."""
-    return make_pursuer(name) if name in PURSUERS else ATTACKS[name]()
+    """An attacking pursuer, or one of `make_pursuer`."""
+    return ATTACKS[name]() if name in ATTACKS else make_pursuer(name)
