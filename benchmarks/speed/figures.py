@@ -125,13 +125,13 @@ def _joint(axes: Axes, section: dict[str, Any]) -> None:
         timed = case["latency"]
         low, middle, high = (timed[key] / 1000.0 for key in ("p50", "p99", "worst"))
         axes.plot([low, high], [place, place], color=style.FAINT, linewidth=2.0, zorder=1)
-        # The numbers lean apart, because a shield that always does the same has them close together.
+        # The numbers stand apart, because a shield that always does the same has them close together.
         marks = (
-            (low, "o", "median", "right"),
-            (middle, "s", "99 of 100", "center"),
-            (high, "X", "worst", "left"),
+            (low, "o", "median", "right", (-6, -2.5)),
+            (middle, "s", "99 of 100", "center", (0, 5)),
+            (high, "X", "worst", "left", (6, -2.5)),
         )
-        for value, marker, word, side in marks:
+        for value, marker, word, side, away in marks:
             axes.scatter(
                 value,
                 place,
@@ -142,13 +142,13 @@ def _joint(axes: Axes, section: dict[str, Any]) -> None:
                 label=word if place == 0 else None,
             )
             axes.annotate(
-                f"{value:.2g}", (value, place), (0, 6), textcoords="offset points", ha=side, fontsize=7
+                f"{value:.2g}", (value, place), away, textcoords="offset points", ha=side, fontsize=7
             )
+    axes.margins(x=0.3)
     _plain_log(axes)
     axes.set_yticks(range(len(cases)), [case["name"] for case in cases])
-    axes.set_ylim(-0.6, len(cases) - 0.1)
+    axes.set_ylim(-1.5, len(cases) - 0.3)  # below the last there is room for the key
     axes.set_xlabel("milliseconds")
-    axes.margins(x=0.16)
     axes.legend(loc="lower center", ncols=3, handletextpad=0.2, columnspacing=0.8)
     style.light_grid(axes, "x")
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 import study_blocks
 
 CODE = "import sys, pathlib, study_blocks; study_blocks.earlier(pathlib.Path(sys.argv[1]), {})"

@@ -1,8 +1,8 @@
 """Hazard: a pursuer of the study cannot be made, which shows after minutes."""
 
 import pytest
-import time_to_target
 
+import time_to_target
 from sidestep.pursuit import PURSUERS
 
 
