@@ -28,6 +28,12 @@ def test_example_of_the_documentation_is_a_campaign():
     assert campaign.compare.by == ("shield",)
 
 
+def test_study_of_ten_seeds_is_a_campaign():
+    campaign = load_campaign(ROOT / "examples" / "study.toml")
+    assert len(campaign.jobs) == 10 * 4
+    assert {job.settings["episodes"] for job in campaign.jobs} == {200}
+
+
 def test_every_combination_is_one_job_and_seeds_are_the_last_to_change_program(load):
     campaign = load(SMALL + 'seed = [3, 1]\nshield = ["none", "game"]\n[settings]\nepisodes = 7\n')
     labels = [(job.labels["shield"], job.labels["seed"]) for job in campaign.jobs]
