@@ -47,6 +47,12 @@ def lane_by_lane(function: Callable[..., Any], lanes: int, *arguments: Any) -> A
     return function(*arguments)
 
 
+def in_lanes(tree: Any, *lanes: int) -> Any:
+    """A pytree of arrays with these axes of lanes behind their own, the same in every lane."""
+    new = (...,) + (None,) * len(lanes)
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[new], (*leaf.shape, *lanes)), tree)
+
+
 def select(flags: Bool[Array, "..."], if_true: Any, if_false: Any) -> Any:
     """`if_true` where `flags`, else `if_false`, for pytrees whose leaves may have further leading axes."""
     return jax.tree.map(lambda a, b: jnp.where(flags, a, b), if_true, if_false)

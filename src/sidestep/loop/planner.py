@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep._arrays import length, stack
+from sidestep._arrays import in_lanes, length, stack
 from sidestep.loop.episode import Episode, EpisodePolicy, Task, hold
 from sidestep.loop.step import CAPTURED, COLLIDED, REACHED, RUNNING, control_step, outcome_of
 from sidestep.safety import start_in_lanes
@@ -111,10 +111,7 @@ class Planner(EpisodePolicy):
         """What the plans lead to, the least cost is best: 0 for the target, else the distance left (m)."""
         count = plans.shape[-1]
         shield = getattr(task.shield, "rows_only", task.shield)
-        world, memory = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, count)),
-            (episode.world, episode.memory),
-        )
+        world, memory = in_lanes((episode.world, episode.memory), count)
         if shield is not task.shield:
             memory = start_in_lanes(shield, world)
         keys = jax.random.split(jax.random.key(0), count)

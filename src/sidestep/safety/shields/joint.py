@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, select
+from sidestep._arrays import AnyArray, Flag, Scalar, in_lanes, norm, real, select
 from sidestep.pursuit import Pursuer, make_pursuer, pursue
 from sidestep.safety.barriers.barrier import BarrierRows
 from sidestep.safety.barriers.budget import Budget
@@ -297,8 +297,7 @@ class JointShield(Shield):
         """Whether the plan stays clear after the action, whichever model drives. For a plan that was not
         clear: whether it still comes to no contact."""
         now, memory, count = inputs.world, inputs.memory, len(self.models)
-        lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, count)), now)
-        action = jnp.broadcast_to(inputs.action[:, None], (2, count))
+        lanes, action = in_lanes((now, inputs.action), count)
         after = moved(self.scenario, lanes, action, jnp.moveaxis(inputs.wheels, 0, -1), self.acceleration)
         worlds = jax.tree.map(lambda leaf: leaf[..., None], select(memory.clear, after, lanes))
         sides = jnp.where(memory.clear, inputs.sides, inputs.held)
@@ -325,11 +324,7 @@ class JointShield(Shield):
         variants = jnp.where(jax.random.bernoulli(keep_key, 0.5, shape), other, rest)
         plans = jnp.concatenate([memory.plan[None], constant, variants])
         ages = jnp.zeros(len(plans), segment.dtype).at[0].set(memory.age)
-        count = len(self.models)
-        worlds = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf[..., None, None], (*leaf.shape, count, len(plans))),
-            inputs.world,
-        )
+        worlds = in_lanes(inputs.world, len(self.models), len(plans))
         outlook = self._imagine(worlds, inputs.held, plans, ages)
         least = jnp.min(outlook.least, axis=0)
         clear = least >= self._floor(inputs.world)
