@@ -13,7 +13,7 @@ from sidestep import load_scenario
 from sidestep.cli import main
 from sidestep.safety import certify
 from sidestep.safety.certificate import obstacles
-from sidestep.safety.clearance import shipped_table
+from sidestep.safety.clearance import checked, shipped_table
 
 SCENARIO = load_scenario("paper-0.15")
 TABLE = shipped_table(SCENARIO)
@@ -126,3 +126,15 @@ def test_the_command_writes_figures_and_json(tmp_path, capsys):
     figures = json.loads((tmp_path / "c.json").read_text())
     assert figures["obstacles"]["beyond"] == pytest.approx(TABLE.farthest)
     assert len(figures["obstacles"]["directions"]) == 16
+
+
+def test_the_proved_share_is_that_of_the_very_table(certificate):
+    found = certificate.obstacles.checked
+    assert found is not None and found == checked(TABLE)
+    assert 0 < found.verified <= found.boxes - found.refuted
+    assert found.at_least < found.verified / found.boxes
+    text = f"of {found.boxes} small boxes of states, drawn where it matters, {found.verified} verify"
+    assert text in said(certificate, "measured")
+    # Another table, though of the same game, has no result.
+    assert checked(replace(TABLE, sweeps=TABLE.sweeps + 1)) is None
+    assert checked(shipped_table(load_scenario("paper"))) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from sidestep.safety.certificate.certificate import Certificate, Claim
+from sidestep.safety.clearance import Checked
 
 PROVED, COMPUTED, MEASURED, NOT_CLAIMED = "proved", "computed", "measured", "not claimed"
 
@@ -209,6 +210,8 @@ def _together(certificate: Certificate) -> list[Claim]:
         "and interpolated, with spare drift for what that loses; not bounded between its nodes."
     )
     claims = [Claim(COMPUTED, text)]
+    if found.checked is not None:
+        claims.append(_proved_share(found.checked))
     gaps = (
         f"Several obstacles: while their centres stay at least {found.smallest_gap:.3g} m apart only one at "
         "a time matters, and the same holds."
@@ -233,6 +236,16 @@ def _together(certificate: Certificate) -> list[Claim]:
         later = f"That an evader that keeps the table's set now still can in {found.seconds:.3g} s."
         claims.append(Claim(NOT_CLAIMED, later))
     return claims
+
+
+def _proved_share(checked: Checked) -> Claim:
+    return Claim(
+        MEASURED,
+        f"How much of that table is proved: of {checked.boxes} small boxes of states, drawn where it matters, "
+        f"{checked.verified} verify for a drift of up to {checked.drift:g} m/s, with bounds that hold at "
+        f"every state, motion and instant (at least {100.0 * checked.at_least:.3g} % of such boxes, at 95 %). "
+        f"In {checked.refuted} a motion was found that leaves the set. The rest is undecided.",
+    )
 
 
 def _start_and_obstacle(certificate: Certificate) -> list[Claim]:

@@ -11,7 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.safety.clearance import ClearanceGame, ClearanceTable, Resolution, Solution, solve, table_for
+from sidestep.safety.clearance import (
+    Checked,
+    ClearanceGame,
+    ClearanceTable,
+    Resolution,
+    Solution,
+    checked,
+    solve,
+    table_for,
+)
 from sidestep.safety.clearance.solve import STAGES
 from sidestep.world.scenario import Scenario
 
@@ -52,6 +61,7 @@ class ObstacleClearance:
       where it was not asked for
     - `directions` see `Direction`
     - `seconds` for which all that holds, None for ever
+    - `checked`: how much of the table is proved, None where that was not tried
     - `start_height` h' of the asked start, `start_clearance` that an obstacle must have from it in the
       `start_worst` direction (rad); `obstacle_margin` of the asked obstacle; None where not asked
     """
@@ -63,6 +73,7 @@ class ObstacleClearance:
     fastest_drift: float | None
     directions: tuple[Direction, ...]
     seconds: float | None = None
+    checked: Checked | None = None
     start_height: float | None = None
     start_clearance: float | None = None
     start_worst: float | None = None
@@ -104,6 +115,7 @@ def obstacle_clearance(
         fastest_drift=fastest_drift(game, drift, tell) if search_drift and table.periods is None else None,
         directions=tuple(_direction(table, h, math.radians(b)) for b in BEARINGS for h in HEIGHTS),
         seconds=None if table.periods is None else table.periods * game.control_period,
+        checked=checked(table),
     )
     if start is None:
         return found

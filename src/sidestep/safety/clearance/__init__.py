@@ -2,15 +2,25 @@
 
 from sidestep.safety.clearance.game import SPARE, ClearanceGame
 from sidestep.safety.clearance.solve import Resolution, Solution, solve
-from sidestep.safety.clearance.table import STEP, ClearanceTable, clearance_table, shipped_table, table_for
+from sidestep.safety.clearance.table import (
+    STEP,
+    Checked,
+    ClearanceTable,
+    checked,
+    clearance_table,
+    shipped_table,
+    table_for,
+)
 
 __all__ = [
     "SPARE",
     "STEP",
+    "Checked",
     "ClearanceGame",
     "ClearanceTable",
     "Resolution",
     "Solution",
+    "checked",
     "clearance_table",
     "shipped_table",
     "solve",

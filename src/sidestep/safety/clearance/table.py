@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from sidestep.safety.clearance.game import SPARE, ClearanceGame
 from sidestep.safety.clearance.grid import Angles, Grid, Spacing
 from sidestep.safety.clearance.solve import ROUGH, STAGES, Resolution, Solution, solve
 from sidestep.store.checkpoints import CheckpointError, read_named, write_arrays
+from sidestep.store.files import read_json
 from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
 from sidestep.world.scenario import Scenario
 
@@ -259,13 +260,39 @@ def table_for(scenario: Scenario, *, progress: Callable[[Solution], None] | None
 def shipped_table(scenario: Scenario) -> ClearanceTable | None:
     """The table that comes with sidestep and serves a scenario (see `ClearanceGame.refuses`), if any: of
     several one for ever, and that with the least clearance."""
-    serving = [table for table in _shipped() if not table.game.refuses(scenario)]
+    serving = [table for table in _shipped().values() if not table.game.refuses(scenario)]
     return min(serving, key=lambda table: (table.periods is not None, table.farthest), default=None)
 
 
+@dataclass(frozen=True)
+class Checked:
+    """What the proof of a table, box by box, came to: of small `boxes` drawn on the boundary of its set,
+    where an obstacle of up to `drift` m/s matters, so many are `verified`, at least the share `at_least` of
+    all such boxes at 95 %; in those `refuted` a motion was found that leaves the set."""
+
+    boxes: int
+    verified: int
+    refuted: int
+    at_least: float
+    drift: float
+
+
+def checked(table: ClearanceTable) -> Checked | None:
+    """The result of `benchmarks/clearance_check.py` that comes with a shipped table; None without one."""
+    path = next((path for path, shipped in _shipped().items() if shipped is table), None)
+    beside = None if path is None else path.with_suffix(".check.json")
+    if path is None or beside is None or not beside.exists():
+        return None
+    found = read_json(beside)
+    if found["asked"]["table"] != hashlib.sha256(path.read_bytes()).hexdigest():
+        return None
+    counts = (found[name] for name in ("boxes", "verified", "refuted", "share at least"))
+    return Checked(*counts, drift=found["asked"]["drift"])
+
+
 @functools.cache
-def _shipped() -> tuple[ClearanceTable, ...]:
-    return tuple(ClearanceTable.load(path) for path in sorted(_FOLDER.glob("*.npz")))
+def _shipped() -> dict[Path, ClearanceTable]:
+    return {path: ClearanceTable.load(path) for path in sorted(_FOLDER.glob("*.npz"))}
 
 
 def _taken(values: Array, index: Any) -> Array:
