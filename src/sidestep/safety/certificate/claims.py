@@ -241,10 +241,10 @@ def _together(certificate: Certificate) -> list[Claim]:
 def _proved_share(checked: Checked) -> Claim:
     return Claim(
         MEASURED,
-        f"How much of that table is proved: of {checked.boxes} small boxes of states, drawn where it matters, "
-        f"{checked.verified} verify for a drift of up to {checked.drift:g} m/s, with bounds that hold at "
-        f"every state, motion and instant (at least {100.0 * checked.at_least:.3g} % of such boxes, at 95 %). "
-        f"In {checked.refuted} a motion was found that leaves the set. The rest is undecided.",
+        f"How much of that table is proved: of {checked.boxes} small boxes of states, drawn where it "
+        f"matters, {checked.verified} verify for a drift of up to {checked.drift:g} m/s, with bounds that "
+        f"hold at every state, motion and instant (at least {100.0 * checked.at_least:.3g} % of such boxes, "
+        f"at 95 %). In {checked.refuted} a motion was found that leaves the set. The rest is undecided.",
     )
 
 
