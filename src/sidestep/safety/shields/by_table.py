@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, Flag, Scalar, norm, real, traced
 from sidestep.safety.barriers.barrier import BarrierRows
@@ -27,13 +26,11 @@ from sidestep.safety.shields.joint import JointShield, real_or_none
 from sidestep.safety.shields.look_ahead import ramp
 from sidestep.safety.shields.masked_cond import masked_cond
 from sidestep.safety.shields.shield import Shield, ShieldResult
-from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
+from sidestep.safety.shields.table_margins import PairMargins
 from sidestep.world.scenario import Scenario
 from sidestep.world.state import World
 
 _HEADINGS = 48
-_TURNS = 2
-"""Final headings of the pursuer's motions, to each side, for which h' is found."""
 _BACK = 8
 """Steps from the velocity found back to the nominal one."""
 
@@ -44,21 +41,6 @@ class TableMemory(eqx.Module):
 
     turn: Scalar
     otherwise: Any
-
-
-class _Margins(eqx.Module):
-    """The evader's margins, m, and what is `known` of each pursuer and obstacle."""
-
-    towards_pursuers: Float[Array, "m"]
-    towards_obstacles: Float[Array, "k"]
-    known: Bool[Array, "n"]
-
-    @property
-    def least(self) -> Float[Array, "2"]:
-        """The least one towards a pursuer, and towards an obstacle."""
-        m = len(self.towards_pursuers)
-        pursuers = jnp.min(self.towards_pursuers, initial=jnp.inf, where=self.known[:m])
-        return jnp.stack([pursuers, jnp.min(self.towards_obstacles, initial=jnp.inf, where=self.known[m:])])
 
 
 @final
@@ -137,7 +119,7 @@ class TableShield(Shield):
 
     def margin(self, world: World) -> Scalar:
         """The margin m (m) now: at least 0 where the evader can stay free of every pursuer and obstacle."""
-        return jnp.min(self._margins(world).least)
+        return jnp.min(self.margins.now(world).least)
 
     def rows(self, world: World, memory: Any) -> BarrierRows:
         game = self.rows_only
@@ -204,7 +186,7 @@ class TableShield(Shield):
         )
         first = limited.action
         arrays, fixed = eqx.partition(self, eqx.is_array)
-        now = self._margins(world)
+        now = self.margins.now(world)
         least = jnp.min(now.least)
         aim = jnp.where(
             least > 0.0,
@@ -280,92 +262,18 @@ class TableShield(Shield):
         towards = heading + jnp.asarray(turns, heading.dtype)
         return self.scenario.evader_speed * jnp.stack([jnp.cos(towards), jnp.sin(towards)], -1)
 
-    def _margins(self, world: World) -> _Margins:
-        """h' less what is to spare towards each pursuer, and for each obstacle the least |p| - R, less the
-        same, over all pursuers."""
-        grid = self.table.grid
-        return self._over_pairs(
-            world,
-            self._alone(world, jnp.zeros_like(world.evader)),
-            lambda z, pose: grid.height(jnp, z[0], z[1]),
-            lambda z, p, pose: norm(p) - self.table(z, p)[1],
-        )
-
     def _margin_after(self, world: World, action: Float[Array, "2"]) -> Float[Array, "2"]:
         """The margins (m) a period after `action` (m/s), whatever pursuers and obstacles do."""
         period = self.scenario.control_period
         if self.acceleration is not None:
             action, _ = ramp(world.evader_velocity, action, self.acceleration, period)
-        move, drift = period * action, period * self._drift
-        motions = jnp.asarray(self.table.game.motions(_TURNS, 2), move.dtype)
-
-        def height(z: Float[Array, "2"], pose: Float[Array, "3"]) -> Scalar:
-            there = jnp.broadcast_to((z + to_pursuer_axes(move, pose[2]))[:, None], (2, len(motions)))
-            seen = to_pursuer_frame(there, motions.T)
-            return jnp.min(self.table.grid.height(jnp, seen[0], seen[1]))
-
-        return self._over_pairs(
-            world,
-            self._alone(world, move) - drift,
-            height,
-            lambda z, p, pose: self.table.spare_after(z, p, to_pursuer_axes(move, pose[2]), drift),
-        ).least
-
-    def _over_pairs(
-        self,
-        world: World,
-        alone: Float[Array, "k"],
-        height: Callable[..., Scalar],
-        gap: Callable[..., Scalar],
-    ) -> _Margins:
-        """The margins by `height(z, pose)` of each pursuer and the least `gap(z, p, pose)`, at most `alone`,
-        of each obstacle, less what is to spare; z and p in the pursuer's frame."""
-        to_pursuers, to_obstacles = self._spares
-        heights, towards_obstacles = [], alone
-        for pose in world.pursuers:
-            z = to_pursuer_frame(world.evader, pose)
-            heights.append(height(z, pose) - to_pursuers)
-            gaps = [
-                gap(z, to_pursuer_axes(p, pose[2]), pose) - to_obstacles
-                for p in world.evader - world.obstacles[:, :2]
-            ]
-            towards_obstacles = _at_most(towards_obstacles, gaps)
-        return _Margins(_stacked(heights, world), towards_obstacles, known_parts(world))
-
-    def _alone(self, world: World, move: Float[Array, "2"]) -> Float[Array, "k"]:
-        """What is left to every obstacle by itself, m, after the evader's `move`."""
-        return (
-            norm(world.evader + move - world.obstacles[:, :2])
-            - self.scenario.collision_distance
-            - self._spares[1]
-        )
+        return self.margins.after(world, period * action).least
 
     @property
-    def _spares(self) -> tuple[Scalar, Scalar]:
-        """What is to spare (m) towards pursuers, beyond the distance of the table, and towards obstacles."""
-        scenario, budget = self.scenario, self.budget
-        more = jnp.maximum(scenario.capture_distance - self.table.game.capture_distance, 0.0)
-        pursuers, obstacles = self.spare_pursuer + more, self.spare_obstacle
-        if budget is None:
-            return pursuers, obstacles
-        off = budget.tracking_error * scenario.control_period
-        return (
-            pursuers + budget.towards_pursuers(scenario) + off,
-            obstacles + budget.towards_obstacles(scenario) + off,
-        )
+    def margins(self) -> PairMargins:
+        """What is to spare towards every pursuer and obstacle."""
+        return PairMargins(self.scenario, self.table, self.spare_pursuer, self.spare_obstacle, self.budget)
 
     def with_acceleration(self, acceleration: float) -> TableShield:
         otherwise = None if self.otherwise is None else self.otherwise.with_acceleration(acceleration)
         return dataclasses.replace(self, acceleration=acceleration, otherwise=otherwise)
-
-    @property
-    def _drift(self) -> Scalar:
-        return norm(self.scenario.obstacle_velocity)
-
-
-def _at_most(values: Float[Array, "k"], others: list[Scalar]) -> Float[Array, "k"]:
-    return jnp.minimum(values, jnp.stack(others)) if others else values
-
-
-def _stacked(values: list[Scalar], world: World) -> Float[Array, "m"]:
-    return jnp.stack(values) if values else jnp.zeros((0,), world.evader.dtype)
