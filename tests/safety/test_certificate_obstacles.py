@@ -130,7 +130,8 @@ def test_the_command_writes_figures_and_json(tmp_path, capsys):
 
 def test_the_proved_share_is_that_of_the_very_table(certificate):
     found = certificate.obstacles.checked
-    assert found is not None and found == checked(TABLE)
+    assert found is not None
+    assert found == checked(TABLE)
     assert 0 < found.verified <= found.boxes - found.refuted
     assert found.at_least < found.verified / found.boxes
     text = f"of {found.boxes} small boxes of states, drawn where it matters, {found.verified} verify"

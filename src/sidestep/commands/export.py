@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Export a trained policy, the filter, or both as one file for a small computer: ONNX or jax.export."""
+    """Export a trained policy, the filter, or both for a small computer: C, ONNX or jax.export."""
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Run folder, or a policy.npz, whose policy to export."""
     out: Path
-    """File to write; never overwritten silently."""
-    format: str = "onnx"
-    """onnx: runs with onnxruntime only, with the filter of the shield game; jax: runs with jax, any
-    shield."""
+    """File to write, for c a folder; never overwritten silently."""
+    format: Literal["onnx", "c", "jax"] = "onnx"
+    """onnx: runs with onnxruntime only, with the filter of the shield game; c: C99 for a microcontroller,
+    any shield that does not look ahead; jax: runs with jax, any shield."""
     what: str = "policy+filter"
     """policy+filter as one program, policy (observation to action) or filter (nominal to safe velocity)."""
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Shield: game for onnx (the look-ahead of joint does not fit a graph); for jax the run's own by
-    default."""
+    """Shield: game for onnx; for c and jax the run's own by default. c takes joint:table, which does not
+    look ahead, in place of joint."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     set: Overrides = ()
@@ -43,6 +43,8 @@ class Export:
     """Budget: time from a pose to the command based on it, s; the evader's own motion counts as predicted."""
     tracking_error: float = bounded(0.0, TRACKING_ERROR)
     """Budget: largest error of the driven velocity with respect to the commanded velocity, m/s."""
+    states: int = bounded(10_000, least=1, most=10_000_000, whole=True)
+    """For c: number of states with answers by which to check it."""
     overwrite: bool = False
     """Replace --out where it exists."""
     json: Path | None = None
@@ -56,13 +58,13 @@ def run(command: Export, console: Console) -> int:
     from sidestep.store.files import is_stream
     from sidestep.store.outputs import try_outputs
 
-    if command.format not in ("onnx", "jax"):
-        raise ValueError(f"unknown format '{command.format}'; use onnx or jax")
     if command.run == "goal-seeking":
         raise ValueError("goal-seeking is built in and has nothing to export; name the run of a training")
-    if command.out.exists() and not command.overwrite and not is_stream(command.out):
+    in_folder = command.format == "c"
+    if not in_folder and command.out.exists() and not command.overwrite and not is_stream(command.out):
         raise ValueError(f"{command.out} exists already; give another file, or --overwrite to replace it")
-    try_outputs(files=[command.out, command.json])
+    outs = [command.out]
+    try_outputs(files=[*([] if in_folder else outs), command.json], folders=outs if in_folder else [])
     policy = load_policy(command.run)
     scenario, config = scenario_of_run(command.run, command.scenario, command.set)
     name = command.shield or ("game" if command.format == "onnx" else config.get("shield", "joint"))
@@ -84,14 +86,20 @@ def run(command: Export, console: Console) -> int:
         from sidestep.bridges.export import export_onnx
 
         about = export_onnx(command.out, scenario, policy, shield=shield, **options)
-    else:
+    elif command.format == "jax":
         from sidestep.bridges.export import export_jax
 
         about = export_jax(command.out, scenario, policy, shield=shield, shield_name=name, **options)
+    else:
+        from sidestep.bridges.export import export_c
+
+        options["states"] = command.states
+        about = export_c(command.out, scenario, policy, shield=shield, shield_name=name, **options)
     write_json_file(command.json, about)
-    size = command.out.stat().st_size
+    written = command.out / "sidestep.c" if in_folder else command.out
+    size = written.stat().st_size
     kept = "" if command.what == "policy" else f", shield {name}"
     console.print(
-        f"{command.what}{kept} as {command.format}: {command.out}, {size / 1000:.0f} kB", highlight=False
+        f"{command.what}{kept} as {command.format}: {written}, {size / 1000:.0f} kB", highlight=False
     )
     return 0
