@@ -58,8 +58,8 @@ class Stored:
 class Loop:
     """Numbers computed `size` times in a row; reductions over them are nodes of the block."""
 
-    def __init__(self, size: int, stage: int, block: Block):
-        self.size, self.stage, self.block = size, stage, block
+    def __init__(self, size: int, stage: int):
+        self.size, self.stage = size, stage
         self.nodes: list[Node] = []
 
 
@@ -79,13 +79,6 @@ class Block:
         """How many stages there are."""
         ends = [node.stage for node in self.nodes] + [stage for stage, _ in self.loops]
         return 1 + max(ends, default=0)
-
-    def within(self, other: Block) -> bool:
-        """Whether it is `other` or lies inside it."""
-        block: Block | None = self
-        while block is not None and block is not other:
-            block = block.parent
-        return block is other
 
 
 class Tables:
@@ -185,7 +178,7 @@ class Program:
         return node
 
     def _loop(self, size: int, stage: int) -> Loop:
-        return self.block.loops.setdefault((stage, size), Loop(size, stage, self.block))
+        return self.block.loops.setdefault((stage, size), Loop(size, stage))
 
     def reduce(self, operation: str, node: Node) -> Node:
         """`min`, `max`, `add`, `and` or `or` of a node over its loop; `argmin`, `argmax`: the first place."""

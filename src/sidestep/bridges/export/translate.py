@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -22,10 +22,14 @@ LONG = 24
 """Entries from which on a dimension becomes a loop."""
 
 
+Nodes: TypeAlias = Any
+"""A NumPy array of `Node`s."""
+
+
 class Looped:
     """An array with one dimension as a loop: `nodes` has the others, `axis` is where it would be."""
 
-    def __init__(self, nodes: np.ndarray, axis: int, size: int):
+    def __init__(self, nodes: Nodes, axis: int, size: int):
         self.nodes, self.axis, self.size = nodes, axis, size
 
     @property
@@ -36,9 +40,7 @@ class Looped:
         return tuple(shape)
 
 
-def translate(
-    program: Program, function: Callable[..., Any], inputs: Sequence[np.ndarray]
-) -> list[np.ndarray]:
+def translate(program: Program, function: Callable[..., Any], inputs: Sequence[Nodes]) -> list[Nodes]:
     """What `function` returns for arrays of nodes, as arrays of nodes.
 
     **Raises** `NotTranslatable`.
@@ -103,7 +105,7 @@ class _Translator:
             if name in _ELEMENTWISE:
                 return [self._each(_ELEMENTWISE[name], inputs, equation.outvars[0].aval)]
             plain = {key: _whole(value) for key, value in parameters.items()}
-            result = rule(equation.replace(params=plain), *inputs)
+            result: Any = rule(equation.replace(params=plain), *inputs)
             return result if primitive.multiple_results else [result]
         except NotImplementedError as error:
             raise NotTranslatable(
@@ -112,7 +114,7 @@ class _Translator:
 
     # Values
 
-    def nodes(self, value: Any) -> np.ndarray:
+    def nodes(self, value: Any) -> Nodes:
         """A value without loop as an array of nodes."""
         assert not isinstance(value, Looped)
         if not _is_known(value):
@@ -147,7 +149,7 @@ class _Translator:
                 nodes[place] = self.program.element(array, counter)
         return Looped(nodes, axis, size)
 
-    def written_out(self, value: Any) -> np.ndarray:
+    def written_out(self, value: Any) -> Nodes:
         """A value as nodes outside of loops."""
         if not isinstance(value, Looped):
             return self.nodes(value)
@@ -163,12 +165,6 @@ class _Translator:
         if node.size is None:
             return self.program.store([(i, node) for i in range(size)], node.kind, size)
         return self.program.store([(0, node)], node.kind, size)
-
-    def arranged(self, value: Any, arrange: Callable[[np.ndarray], np.ndarray]) -> Any:
-        """A value whose entries, which may be in a loop, are put in other places, or left out."""
-        if isinstance(value, Looped):
-            return Looped(arrange(value.nodes), value.axis, value.size)
-        return arrange(self.nodes(value))
 
     def op(self, operation: str, *inputs: Node) -> Node:
         """The node of an elementwise operation; computed now where everything is known."""
@@ -479,9 +475,9 @@ class _Translator:
 
     def _dynamic_slice(self, equation: Any, value: Any, *starts: Any) -> Any:
         sizes = equation.params["slice_sizes"]
-        indices = [self.nodes(start)[()] if not isinstance(start, Looped) else start for start in starts]
-        if any(isinstance(index, Looped) for index in indices):
+        if any(isinstance(start, Looped) for start in starts):
             raise NotImplementedError("a start that changes in a loop")
+        indices = [self.nodes(start)[()] for start in starts]
         made = np.empty(sizes, object)
         firsts = [
             self._clipped(index, size - length)
@@ -672,7 +668,7 @@ def _flag(me: _Translator, node: Node) -> Node:
     return node if node.kind == "b" else me.op("ne", node, me.program.constant(np.int32(0)))
 
 
-def _spread(nodes: np.ndarray, shape: tuple[int, ...], dimensions: Sequence[int]) -> np.ndarray:
+def _spread(nodes: Nodes, shape: tuple[int, ...], dimensions: Sequence[int]) -> Nodes:
     """`lax.broadcast_in_dim` of an array of nodes."""
     own = [1] * len(shape)
     for k, d in enumerate(dimensions):
