@@ -264,7 +264,7 @@ def test_every_code_block_of_the_pages_is_of_a_kind_that_runs_or_is_only_shown()
                 if fence and fence[2] == inside and not fence[3]:
                     inside = None
             elif fence:
-                assert fence[3] in {"python", "sh", "text", "toml", "yaml"}, where
+                assert fence[3] in {"c", "python", "sh", "text", "toml", "yaml"}, where
                 inside = fence[2]
             else:
                 assert before or not line.startswith("    "), f"{where}: fence it"
