@@ -78,6 +78,7 @@ BRIEFLY = {
     "campaign": "--dry-run",
     "report": "--episodes 4",
     "falsify": "--batch 16 --seconds 2",
+    "export": "--states 500",
 }
 """What is added to the words of a command, so that it is soon done; the last of two values counts."""
 

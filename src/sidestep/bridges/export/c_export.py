@@ -283,13 +283,9 @@ class _Export:
         if self.policy is not None and self.what != "filter":
             lines += ["/* Control periods between two decisions of the policy. */"]
             lines += [f"#define SIDESTEP_DECISION_STEPS {decision_steps_of(self.policy)}"]
-        if self.used:
-            lines += [
-                "",
-                "typedef struct {",
-                *(field.declaration for field in self.used),
-                "} sidestep_world;",
-            ]
+        if self.what != "policy":
+            members = [field.declaration for field in self.used] or ["    char none;"]
+            lines += ["", "typedef struct {", *members, "} sidestep_world;"]
         if self.what != "policy":
             lines += ["", "/* What the shield keeps from call to call. */", "typedef struct {"]
             lines += [field.declaration for field in self.memory] or ["    char none;"]

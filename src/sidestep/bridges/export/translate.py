@@ -384,8 +384,8 @@ class _Translator:
     def _over_loop(self, operation: str, node: Node, size: int) -> Node:
         if node.size is not None:
             return self.program.reduce(operation, node)
-        if operation in ("add", "mul"):
-            raise NotImplementedError("a sum of equal numbers over a loop")
+        if operation == "add":
+            return self.op("mul", node, self.program.constant(KINDS[node.kind](size)))
         return node
 
     def _reduce_min(self, equation: Any, value: Any) -> Any:
