@@ -13,8 +13,7 @@ from typing import Any, TypeAlias
 
 import jax
 import numpy as np
-from jax._src import source_info_util
-from jax.extend import core
+from jax.extend import core, source_info_util
 
 from sidestep.bridges.export.program import KINDS, Node, NotTranslatable, Program, Stored
 
@@ -238,9 +237,6 @@ class _Translator:
         nodes = np.squeeze(value.nodes, tuple(d - (d > value.axis) for d in gone))
         return Looped(nodes, value.axis - sum(d < value.axis for d in gone), value.size)
 
-    def _expand_dims(self, equation: Any, value: Any) -> Any:
-        return self._reshape_to(value, equation.outvars[0].aval.shape)
-
     def _transpose(self, equation: Any, value: Any) -> Any:
         order = equation.params["permutation"]
         if not isinstance(value, Looped):
@@ -337,9 +333,6 @@ class _Translator:
             array = self.program.store(parts, parts[0][1].kind, total)
             nodes[place] = self.program.element(array, counter)
         return Looped(nodes, axis, total)
-
-    def _iota(self, equation: Any) -> Any:
-        raise NotImplementedError("a dynamic shape")
 
     def _cumprod(self, equation: Any, value: Any) -> Any:
         return self._running("mul", equation, value)
