@@ -19,7 +19,7 @@ from sidestep.trials.falsification.chases import Target, run_from
 from sidestep.world import World
 
 SCENARIO = load_scenario("paper-0.15")
-SHIELD = make_shield("joint", SCENARIO)
+SHIELD = make_shield("joint:table", SCENARIO)
 ASK = eqx.filter_jit(lambda shield, world, nominal: shield(world, nominal, shield.init(world))[0])
 
 
@@ -34,16 +34,20 @@ PINNED = world_of([0.2, 0.0], [0.55, 0.1])
 
 
 def test_joint_takes_the_table_where_one_is_shipped_and_looks_ahead_elsewhere():
-    assert isinstance(SHIELD, TableShield)
+    joint = make_shield("joint", SCENARIO)
+    assert isinstance(joint, TableShield)
     assert isinstance(make_shield("joint", load_scenario("paper-0.10")), TableShield)
     assert isinstance(make_shield("joint", load_scenario("paper", control_period=0.1)), JointShield)
     assert isinstance(make_shield("joint:look-ahead", SCENARIO), JointShield)
     assert isinstance(make_shield("joint:table", SCENARIO), TableShield)
+    # What its table cannot keep is left to the look-ahead: of 10,000 chases by nash 136 were lost without it.
+    assert isinstance(joint.otherwise, JointShield)
+    assert joint.looks_ahead
     assert SHIELD.otherwise is None
     # On robots with errors and slow motors looking ahead was safer.
     assert isinstance(make_shield("joint", SCENARIO, Budget(position_error=0.001)), JointShield)
     assert not SHIELD.looks_ahead
-    # A table for some seconds leaves what it cannot keep to the look-ahead.
+    # So does a table for some seconds.
     paper = make_shield("joint", load_scenario("paper"))
     assert isinstance(paper, TableShield)
     assert paper.table.periods * 0.05 == pytest.approx(4.0)
@@ -77,7 +81,7 @@ def test_in_a_crowd_joint_looks_ahead_and_elsewhere_it_goes_by_the_table():
 
 
 def test_names_lead_back_to_the_same_shield():
-    assert name_of(SHIELD, SCENARIO) == "joint"
+    assert name_of(SHIELD, SCENARIO) == "joint:table"
     assert name_of(make_shield("joint:look-ahead", SCENARIO), SCENARIO) == "joint:look-ahead"
     paper = load_scenario("paper")
     assert name_of(make_shield("joint", paper), paper) == "joint"
@@ -229,9 +233,9 @@ def test_any_number_of_robots(pursuers, obstacles):
     scenario = load_scenario("paper-0.15", pursuer_count=pursuers, obstacle_count=obstacles)
     shield = make_shield("joint", scenario)
     assert isinstance(shield, TableShield)
-    assert (shield.otherwise is None) == (pursuers + obstacles < 3)
+    assert isinstance(shield.otherwise, JointShield)
     if obstacles < 3:
-        count = 40 if shield.otherwise is None else 4
+        count = 4 if obstacles else 40
         result = evaluate(scenario, goal_seeking, shield, "nash", count, jax.random.key(0))
         assert result.safe == count
         assert result.reached >= 0.9 * count

@@ -64,7 +64,7 @@ class TableShield(Shield):
 
     **Otherwise.** Where that leaves no margin towards obstacles, and where a second obstacle or pursuer is
     within `near` (m) of contact, the shield `otherwise` decides if there is one. `make_shield` gives a
-    look-ahead for several obstacles or pursuers, and for tables that are not for ever.
+    look-ahead.
 
     **Arguments:** `budget` is kept beside what is to spare, and a tracking error e costs e T more in every
     period; `acceleration` m/s^2: in the period the evader changes its velocity, `world.evader_velocity`, no

@@ -78,10 +78,9 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
     if name == "joint" and budget is None and not traced(scenario):
         table = shipped_table(scenario)
         if table is not None:
-            # Where two obstacles or pursuers matter at once, or after its time, a table promises nothing.
-            several = scenario.obstacle_count > 1 or scenario.pursuer_count > 1
-            decided = table.periods is None and not several
-            return TableShield(scenario, table, otherwise=None if decided else JointShield(scenario))
+            # A table promises nothing where several obstacles or pursuers matter at once, and after its time.
+            # Nor is it exact: straight ahead of a pursuer, beside an obstacle, its set is now and then left.
+            return TableShield(scenario, table, otherwise=JointShield(scenario))
     if name == "joint:table":
         return TableShield(scenario, table_for(scenario), budget=budget)
     kind: Any = (SHIELDS | JOINT_FORMS)[name]
