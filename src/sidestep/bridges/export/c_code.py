@@ -7,9 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.bridges.export.program import KINDS, Block, Loop, Node, NotTranslatable, Program, Stored, live
+from sidestep.bridges.export.program import (
+    KINDS,
+    Block,
+    Loop,
+    Node,
+    NotTranslatable,
+    Program,
+    Stored,
+    kind_of,
+    live,
+)
 
-_TYPES = {"f": "float", "i": "int32_t", "b": "bool"}
+TYPES = {"f": "float", "i": "int32_t", "b": "bool"}
+"""What C calls each kind of number."""
 _INLINE = 60
 """Characters up to which what is used once is written where it is used."""
 _WIDTH = 100
@@ -85,8 +96,8 @@ def number(value: Any) -> str:
 
 def table(name: str, values: np.ndarray) -> list[str]:
     """A constant array; whole numbers keep their width."""
-    kind = {"f": "f", "b": "b"}.get(values.dtype.kind, "i")
-    width = f"{values.dtype.name}_t" if kind == "i" else _TYPES[kind]
+    kind = kind_of(values.dtype)
+    width = f"{values.dtype.name}_t" if kind == "i" else TYPES[kind]
     lines, line = [f"static const {width} {name}[{len(values)}] = {{"], "   "
     for entry in (number(value).strip("()") for value in values.astype(KINDS[kind])):
         if len(line) + len(entry) + 2 > _WIDTH:
@@ -151,7 +162,7 @@ class CBody:
     def _block(self, block: Block) -> list[str]:
         lines = []
         for array in sorted(self.arrays[block], key=lambda array: (array.stage, array.size)):
-            lines.append(f"{_TYPES[array.kind]} {self._name(array, 'a')}[{array.size}];")
+            lines.append(f"{TYPES[array.kind]} {self._name(array, 'a')}[{array.size}];")
         reductions: dict[Loop, list[Node]] = defaultdict(list)
         for node in block.nodes:
             if node.operation == "reduce" and node in self.live:
@@ -187,7 +198,7 @@ class CBody:
                     "}",
                 ]
                 continue
-            before.append(f"{_TYPES[kind]} {name} = {_FIRST[node.about, kind]};")
+            before.append(f"{TYPES[kind]} {name} = {_FIRST[node.about, kind]};")
             inside.append(f"{name} = {_OPERATIONS[kind][node.about].format(name, value)};")
         for array, offset, node in self.parts[loop]:
             where = f"i + {offset}" if offset else "i"
@@ -220,13 +231,13 @@ class CBody:
                 f"    {name} += table{int(numbered.about)}[{row}] * {values}[k];",
                 "}",
             ]
-        return [f"const {_TYPES[node.kind]} {name} = {_bare(self._expression(node))};"]
+        return [f"const {TYPES[node.kind]} {name} = {_bare(self._expression(node))};"]
 
     def _condition(self, node: Node) -> list[str]:
         blocks, results = node.about
         wanted = sorted({one.about for one in self._live_nodes("result") if one.inputs[0] is node})
         index, name = self._text(node.inputs[0]), self._name(node, "r")
-        lines = [f"{_TYPES[results[0][k].kind]} {name}_{k};" for k in wanted]
+        lines = [f"{TYPES[results[0][k].kind]} {name}_{k};" for k in wanted]
         for number_, (block, found) in enumerate(zip(blocks, results, strict=True)):
             last = number_ == len(blocks) - 1
             test = "" if last else f"if ({index} {'<=' if number_ == 0 else '=='} {number_}) "
@@ -275,7 +286,7 @@ class CBody:
         if operation.startswith("to_"):
             return _converted(inputs[0], node.inputs[0].kind, node.kind)
         if operation not in _OPERATIONS[node.kind]:
-            raise NotTranslatable(f"there is no {operation!r} of {_TYPES[node.kind]} in C yet")
+            raise NotTranslatable(f"there is no {operation!r} of {TYPES[node.kind]} in C yet")
         return _OPERATIONS[node.kind][operation].format(*inputs)
 
 

@@ -16,10 +16,10 @@ import numpy as np
 
 import sidestep
 from sidestep._arrays import real
-from sidestep.bridges.export.c_code import HELPERS, CBody, number, table
+from sidestep.bridges.export.c_code import HELPERS, TYPES, CBody, number, table
 from sidestep.bridges.export.files import STATUS_WORDS, UNITS, check_what, facts
 from sidestep.bridges.export.parity import answers, random_states
-from sidestep.bridges.export.program import Node, Program, Tables
+from sidestep.bridges.export.program import KINDS, Node, Program, Tables, kind_of
 from sidestep.bridges.export.translate import translate
 from sidestep.loop.step import decide, decision_steps_of
 from sidestep.safety import Shield
@@ -32,7 +32,6 @@ FILES = (
 )  # fmt: skip
 """The files of an export."""
 _MAGIC = 0x53494445
-_C_TYPES = {"f": "float", "i": "int32_t", "b": "bool"}
 
 
 class _Field(NamedTuple):
@@ -50,7 +49,7 @@ class _Field(NamedTuple):
     @property
     def declaration(self) -> str:
         sizes = "".join(f"[{size}]" for size in self.shape)
-        line = f"    {_C_TYPES[self.kind]} {self.name}{sizes};"
+        line = f"    {TYPES[self.kind]} {self.name}{sizes};"
         return f"{line:<32} /* {self.words} */" if self.words else line
 
     def entries(self, before: str) -> list[str]:
@@ -165,7 +164,7 @@ class _Export:
             memory, self.structure = jax.tree.flatten_with_path(shield.init(self._world(*self._zeros())))
             for keys, leaf in memory:
                 name = re.sub(r"\W+", "_", jax.tree_util.keystr(keys)).strip("_") or "sides"
-                self.memory.append(_Field(name, leaf.shape, np.dtype(leaf.dtype).kind))
+                self.memory.append(_Field(name, leaf.shape, kind_of(leaf.dtype)))
             self._add_shield()
         if policy is not None and what != "filter":
             self._add_policy()
@@ -286,7 +285,6 @@ class _Export:
         if self.what != "policy":
             members = [field.declaration for field in self.used] or ["    char none;"]
             lines += ["", "typedef struct {", *members, "} sidestep_world;"]
-        if self.what != "policy":
             lines += ["", "/* What the shield keeps from call to call. */", "typedef struct {"]
             lines += [field.declaration for field in self.memory] or ["    char none;"]
             lines += ["} sidestep_memory;", "", "typedef struct {"]
@@ -302,12 +300,13 @@ class _Export:
         lines = ['#include "sidestep.h"', "", "#include <math.h>", ""]
         body: list[str] = []
         for function in self.functions:
+            inside = function.body.lines()
             unused = [
                 f"    (void){name};"
                 for name in re.findall(r"(\w+)(?:\[\d+\])?[,)]", function.head)
-                if not any(re.search(rf"\b{name}\b", line) for line in function.body.lines())
+                if not any(re.search(rf"\b{name}\b", line) for line in inside)
             ]
-            body += ["", function.head, "{", *unused, *function.body.lines(), "}"]
+            body += ["", function.head, "{", *unused, *inside, "}"]
         text = "\n".join(body)
         for helper in re.split(r"(?=static inline)", HELPERS):
             name = re.search(r"(\w+)\(", helper)
@@ -355,7 +354,7 @@ class _Export:
                 lines.append(f"memcpy(&{where}, in + {at}, sizeof {where});")
             else:
                 lines += [
-                    f"{name} = ({_C_TYPES[field.kind]})in[{at + k}];"
+                    f"{name} = ({TYPES[field.kind]})in[{at + k}];"
                     for k, name in enumerate(field.entries("memory."))
                 ]
             at += field.size
@@ -390,10 +389,7 @@ class _Export:
             found, allowed = answers(self._policy, inputs, measured=1, loose=2, seed=2)
             return self._rows(inputs, found, allowed, 2)
         memory = [
-            rng.integers(-1, 2, (count, *field.shape)).astype(
-                {"f": np.float32, "i": np.int32, "b": bool}[field.kind]
-            )
-            for field in self.memory
+            rng.integers(-1, 2, (count, *field.shape)).astype(KINDS[field.kind]) for field in self.memory
         ]
         spare = [np.zeros((count, *field.shape), np.float32) for field in self.fields]
         used = {field.name for field in self.used}

@@ -19,6 +19,11 @@ KINDS = {"f": np.float32, "i": np.int32, "b": np.bool_}
 """Kinds of numbers: real ones in single precision, whole ones, and flags."""
 
 
+def kind_of(dtype: Any) -> str:
+    """The kind of numbers of a dtype."""
+    return "i" if np.dtype(dtype).kind == "u" else np.dtype(dtype).kind
+
+
 class NotTranslatable(ValueError):
     """What a function uses and no back end has; names the primitive and the line of ours it comes from."""
 
@@ -113,7 +118,7 @@ class Program:
     def constant(self, value: Any) -> Node:
         """A number known now."""
         value = np.asarray(value)
-        kind = {"f": "f", "i": "i", "u": "i", "b": "b"}[value.dtype.kind]
+        kind = kind_of(value.dtype)
         number = KINDS[kind](value)
         return self._leaf(("constant", kind, number.tobytes()), Node("constant", (), kind, number))
 
@@ -131,8 +136,7 @@ class Program:
         """The number at a flat `index` into a constant array, which must lie within it."""
         if index.constant:
             return self.constant(table.reshape(-1)[int(index.about)])
-        kind = {"f": "f", "i": "i", "u": "i", "b": "b"}[table.dtype.kind]
-        return self.make("entry", index, kind=kind, about=self.tables.number(table))
+        return self.make("entry", index, kind=kind_of(table.dtype), about=self.tables.number(table))
 
     def _leaf(self, key: Any, node: Node) -> Node:
         return self.root.known.setdefault(key, node)

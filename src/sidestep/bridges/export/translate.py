@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.extend import core, source_info_util
 
-from sidestep.bridges.export.program import KINDS, Node, NotTranslatable, Program, Stored
+from sidestep.bridges.export.program import KINDS, Node, NotTranslatable, Program, Stored, kind_of
 
 LONG = 24
 """Entries from which on a dimension becomes a loop."""
@@ -632,7 +632,7 @@ class _Translator:
         )
 
     def _convert_element_type(self, equation: Any, value: Any) -> Any:
-        kind = {"f": "f", "i": "i", "u": "i", "b": "b"}[np.dtype(equation.params["new_dtype"]).kind]
+        kind = kind_of(equation.params["new_dtype"])
 
         def convert(me: _Translator, node: Node) -> Node:
             if node.kind == kind:
