@@ -12,8 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.bridges.export import NotTranslatable, export_c
+from sidestep.bridges.export import NotTranslatable, export_c, export_onnx
 from sidestep.bridges.export.c_code import HELPERS, CBody, table
+from sidestep.bridges.export.exported import Field
+from sidestep.bridges.export.graph import Graph
+from sidestep.bridges.export.onnx_code import write_numbers
 from sidestep.bridges.export.program import Program
 from sidestep.bridges.export.translate import LONG, translate
 from sidestep.cli import main
@@ -113,7 +116,7 @@ def test_the_python_check_says_the_same(exported):
     assert "3000 states: 0 differ" in done.stdout
 
 
-def test_joint_by_its_table_answers_as_in_jax(compiler, tmp_path):
+def test_joint_by_its_table_answers_as_in_jax_as_an_onnx_graph_too(compiler, tmp_path):
     scenario = load_scenario("paper")
     shield = make_shield("joint:table", scenario)
     export_c(tmp_path, scenario, None, what="filter", shield=shield, shield_name="joint:table", states=1000)
@@ -124,6 +127,27 @@ def test_joint_by_its_table_answers_as_in_jax(compiler, tmp_path):
     code = (tmp_path / "sidestep.c").read_text()
     assert "static const uint16_t" in code
     assert "malloc" not in code
+
+    ort = pytest.importorskip("onnxruntime")
+    path = tmp_path / "filter.onnx"
+    export_onnx(path, scenario, None, what="filter", shield=shield, shield_name="joint:table")
+    session = ort.InferenceSession(path, providers=["CPUExecutionProvider"])
+    _, inputs, outputs = np.fromfile(tmp_path / "states.bin", "<u4", 4)[1:]
+    rows = np.fromfile(tmp_path / "states.bin", "<f4", offset=20).reshape(1000, inputs + outputs + 1)
+    state, at = {}, 0
+    for given in session.get_inputs():
+        shape = given.shape[1:]
+        size = int(np.prod(shape))
+        state[given.name] = rows[:, at : at + size].reshape(-1, *shape)
+        at += size
+    assert at == inputs
+    found = [part.reshape(1000, -1).astype(np.float32) for part in session.run(None, state)]
+    found, wanted, allowed = np.concatenate(found, 1), rows[:, inputs:-1], rows[:, -1]
+    clear = np.isfinite(allowed)
+    np.testing.assert_array_equal(found[clear, 2:], wanted[clear, 2:])
+    off = np.max(np.abs(found - wanted)[clear, :2], 1) - allowed[clear]
+    assert np.max(off) <= 3e-3
+    assert np.mean(off > 0.0) <= 3e-3
 
 
 def ours(x):
@@ -155,6 +179,15 @@ def ours(x):
     )
 
 
+def random_inputs():
+    """Of `ours`. XLA's reductions do not say what becomes of a NaN."""
+    rng = np.random.default_rng(1)
+    states = rng.normal(size=(2000, 6)).astype(np.float32)
+    states[:40] = np.round(states[:40])
+    states[np.arange(40, 80), rng.integers(2, 6, 40)] = rng.choice([1e30, -1e30, 0.0], 40)
+    return states
+
+
 def test_every_kind_of_operation_is_that_of_jax(compiler, tmp_path):
     program = Program()
     given = np.array([program.given(f"in[{k}]", "f") for k in range(6)], object)
@@ -171,17 +204,28 @@ def test_every_kind_of_operation_is_that_of_jax(compiler, tmp_path):
     subprocess.run([compiler, *options, "-o", library, source, "-lm"], check=True)
     f = ctypes.CDLL(str(library)).f
     f.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
-    rng = np.random.default_rng(1)
-    states = rng.normal(size=(2000, 6)).astype(np.float32)
-    states[:40] = np.round(states[:40])
-    # XLA's reductions do not say what becomes of a NaN.
-    states[np.arange(40, 80), rng.integers(2, 6, 40)] = rng.choice([1e30, -1e30, 0.0], 40)
+    states = random_inputs()
     wanted = [np.asarray(part, np.float32).reshape(2000, -1) for part in jax.jit(jax.vmap(ours))(states)]
     wanted = np.concatenate(wanted, 1)
     found = np.empty_like(wanted)
     for state, out in zip(states, found, strict=True):
         f(state.ctypes.data, out.ctypes.data)
     np.testing.assert_allclose(found, wanted, rtol=2e-5, atol=2e-6)
+
+
+def test_every_kind_of_operation_is_that_of_jax_in_onnx():
+    ort = pytest.importorskip("onnxruntime")
+    program, graph, given = Program(), Graph(), Field("x", (6,), "f")
+    results = translate(program, ours, [given.given(program)])
+    fields = [Field(f"o{k}", part.shape, part.reshape(-1)[0].kind) for k, part in enumerate(results)]
+    write_numbers(graph, program, [given], list(zip(fields, results, strict=True)))
+    session = ort.InferenceSession(graph.model("ours", "", {}), providers=["CPUExecutionProvider"])
+    states = random_inputs()
+    for found, wanted in zip(session.run(None, {"x": states}), jax.jit(jax.vmap(ours))(states), strict=True):
+        assert found.shape == wanted.shape
+        # An angle of half a turn has either sign.
+        same = np.isclose(found, wanted, rtol=2e-5, atol=2e-6) | np.isclose(np.abs(found), np.pi)
+        assert np.all(same | (np.asarray(wanted) == -np.float32(np.pi)))
 
 
 def test_what_cannot_be_translated_is_named_with_its_line():

@@ -34,9 +34,10 @@ def test_the_claims_name_the_tables_own_distances(certificate):
     assert 0.5 < found.beyond < 0.6
     assert found.smallest_gap == pytest.approx(2.0 * (found.beyond + (0.1574 + 0.02) * 0.05), abs=1e-6)
     computed = said(certificate, "computed")
-    assert f"farther than {found.beyond:.3g} m away stays free of both for ever" in computed
+    assert f"farther than {found.beyond:.3g} m away can stay free of both for ever" in computed
     assert f"at least {found.smallest_gap:.3g} m apart" in computed
     assert "up to 0.02 m/s" in computed
+    assert "goes by the table alone" in said(certificate, "not claimed")
     assert max(one.worst for one in found.directions) <= found.beyond
     for one in found.directions:
         assert 0.2 - 1e-6 <= one.best <= one.worst

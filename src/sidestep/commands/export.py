@@ -24,13 +24,13 @@ class Export:
     out: Path
     """File to write, for c a folder; never overwritten silently."""
     format: Literal["onnx", "c", "jax"] = "onnx"
-    """onnx: runs with onnxruntime only, with the filter of the shield game; c: C99 for a microcontroller,
-    any shield that does not look ahead; jax: runs with jax, any shield."""
+    """onnx: runs with onnxruntime only; c: C99 for a microcontroller; both for any shield that does not look
+    ahead; jax: runs with jax, any shield."""
     what: str = "policy+filter"
     """policy+filter as one program, policy (observation to action) or filter (nominal to safe velocity)."""
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Shield: game for onnx; for c and jax the run's own by default. c takes joint:table, which does not
-    look ahead, in place of joint."""
+    """Shield: game for onnx, the run's own for c and jax by default. c and onnx take joint:table, which does
+    not look ahead, in place of joint."""
     scenario: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Preset or file; the run's own scenario, or paper, by default."""
     set: Overrides = ()
@@ -68,11 +68,6 @@ def run(command: Export, console: Console) -> int:
     policy = load_policy(command.run)
     scenario, config = scenario_of_run(command.run, command.scenario, command.set)
     name = command.shield or ("game" if command.format == "onnx" else config.get("shield", "joint"))
-    if command.format == "onnx" and name != "game":
-        raise ValueError(
-            f"an ONNX graph holds the rows of the shield 'game', not '{name}'; leave out --shield, or use "
-            "--format jax"
-        )
     if command.what != "policy":
         from sidestep.bridges.export import ALONE
 
@@ -85,7 +80,7 @@ def run(command: Export, console: Console) -> int:
     if command.format == "onnx":
         from sidestep.bridges.export import export_onnx
 
-        about = export_onnx(command.out, scenario, policy, shield=shield, **options)
+        about = export_onnx(command.out, scenario, policy, shield=shield, shield_name=name, **options)
     elif command.format == "jax":
         from sidestep.bridges.export import export_jax
 

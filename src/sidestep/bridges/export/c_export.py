@@ -11,20 +11,19 @@ from string import Template
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import sidestep
-from sidestep._arrays import real
 from sidestep.bridges.export.c_code import HELPERS, TYPES, CBody, number, table
-from sidestep.bridges.export.files import STATUS_WORDS, UNITS, check_what, facts
+from sidestep.bridges.export.exported import Exported, Field
+from sidestep.bridges.export.files import STATUS_WORDS, UNITS, check_looks_ahead, check_what, facts
 from sidestep.bridges.export.parity import answers, random_states
-from sidestep.bridges.export.program import KINDS, Node, Program, Tables, kind_of
+from sidestep.bridges.export.program import KINDS, Node, Program, Tables
 from sidestep.bridges.export.translate import translate
-from sidestep.loop.step import decide, decision_steps_of
+from sidestep.loop.step import decision_steps_of
 from sidestep.safety import Shield
 from sidestep.store.files import make_folder, write_bytes, write_json
-from sidestep.world import Scenario, World, observation_size, observe
+from sidestep.world import Scenario, World, observe
 
 FILES = (
     "sidestep.h", "sidestep.c", "check.c", "check.py", "states.bin", "CMakeLists.txt", "README.md",
@@ -34,33 +33,11 @@ FILES = (
 _MAGIC = 0x53494445
 
 
-class _Field(NamedTuple):
-    """A member of a struct: name, shape, kind of number, and what it says about itself."""
-
-    name: str
-    shape: tuple[int, ...]
-    kind: str
-    words: str = ""
-
-    @property
-    def size(self) -> int:
-        return int(np.prod(self.shape))
-
-    @property
-    def declaration(self) -> str:
-        sizes = "".join(f"[{size}]" for size in self.shape)
-        line = f"    {TYPES[self.kind]} {self.name}{sizes};"
-        return f"{line:<32} /* {self.words} */" if self.words else line
-
-    def entries(self, before: str) -> list[str]:
-        """How C names each number of it."""
-        return [before + self.name + "".join(f"[{k}]" for k in place) for place in np.ndindex(*self.shape)]
-
-    def given(self, program: Program, before: str) -> np.ndarray:
-        """Its numbers as inputs of a program."""
-        made = np.empty(self.size, object)
-        made[:] = [program.given(name, self.kind) for name in self.entries(before)]
-        return made.reshape(self.shape)
+def _declaration(field: Field) -> str:
+    """A member of a struct."""
+    sizes = "".join(f"[{size}]" for size in field.shape)
+    line = f"    {TYPES[field.kind]} {field.name}{sizes};"
+    return f"{line:<32} /* {field.words} */" if field.words else line
 
 
 class _Function(NamedTuple):
@@ -95,12 +72,8 @@ def export_c(
     written. **Raises** `OutputError` for a folder that cannot be written.
     """
     check_what(scenario, what, policy)
-    if what != "policy" and shield.looks_ahead:
-        name = f"the shield {shield_name!r}" if shield_name else "this shield"
-        raise ValueError(
-            f"{name} looks ahead here, thousands of simulated steps per decision: that is not exported as C. "
-            "Take 'joint:table', which goes by the clearance table alone, or 'game' (--shield)"
-        )
+    if what != "policy":
+        check_looks_ahead(shield, shield_name, "C")
     path = Path(path)
     there = [name for name in FILES if (path / name).exists()]
     if there and not overwrite:
@@ -140,31 +113,14 @@ def _template(name: str) -> Template:
     return Template((files("sidestep.bridges.export") / "templates" / name).read_text())
 
 
-class _Export:
+class _Export(Exported):
     """What is translated, and the texts made of it."""
 
     def __init__(self, scenario: Scenario, policy: Callable[..., Any] | None, shield: Shield, what: str):
-        self.scenario, self.policy, self.shield, self.what = scenario, policy, shield, what
+        super().__init__(scenario, policy, shield, what)
         self.tables = Tables()
-        m, k = scenario.pursuer_count, scenario.obstacle_count
-        self.fields = [
-            _Field("evader", (2,), "f", "x, y in m"),
-            _Field("pursuers", (m, 3), "f", "x, y in m, heading in rad"),
-            _Field("obstacles", (k, 4), "f", "x, y in m, vx, vy in m/s"),
-            _Field("target", (2,), "f", "x, y in m"),
-            _Field("time", (), "f", "s since the start"),
-            _Field("evader_velocity", (2,), "f", "driven in the last period, m/s"),
-            _Field("wheel_speeds", (m, 2), "f", "left, right, in the last period, m/s"),
-        ]
-        self.seen = _Field("observation", (observation_size(scenario),), "f")
-        self.wish = _Field("wish", (2,), "f", "nominal velocity in m/s")
-        self.memory: list[_Field] = []
         self.functions: list[_Function] = []
         if what != "policy":
-            memory, self.structure = jax.tree.flatten_with_path(shield.init(self._world(*self._zeros())))
-            for keys, leaf in memory:
-                name = re.sub(r"\W+", "_", jax.tree_util.keystr(keys)).strip("_") or "sides"
-                self.memory.append(_Field(name, leaf.shape, kind_of(leaf.dtype)))
             self._add_shield()
         if policy is not None and what != "filter":
             self._add_policy()
@@ -176,32 +132,6 @@ class _Export:
         m, k = self.scenario.pursuer_count, self.scenario.obstacle_count
         return f"{m} pursuer{'s' * (m != 1)} and {k} obstacle{'s' * (k != 1)}"
 
-    # The functions as JAX has them
-
-    def _zeros(self) -> list[Any]:
-        return [real(jnp.zeros(field.shape)) for field in self.fields]
-
-    @staticmethod
-    def _world(*values: Any) -> World:
-        return World(*values)
-
-    def _start(self, *world: Any) -> tuple[Any, ...]:
-        return tuple(jax.tree.leaves(self.shield.init(self._world(*world))))
-
-    def _filter(self, *values: Any) -> tuple[Any, ...]:
-        n = len(self.fields)
-        memory = jax.tree.unflatten(self.structure, values[n + 1 :])
-        result, after = self.shield(self._world(*values[:n]), values[n], memory)
-        return (result.action, result.status, *jax.tree.leaves(after))
-
-    def _wish(self, *world: Any) -> tuple[Any, ...]:
-        assert self.policy is not None
-        return (decide(self.scenario, self.policy, self._world(*world)),)
-
-    def _policy(self, observation: Any) -> tuple[Any, ...]:
-        assert self.policy is not None
-        return (self.policy(observation),)
-
     # The functions as C has them
 
     def _add(
@@ -209,7 +139,7 @@ class _Export:
         function: Callable[..., Any],
         head: str,
         words: str,
-        inputs: list[tuple[_Field, str]],
+        inputs: list[tuple[Field, str]],
         outputs: list[str],
     ) -> None:
         program = Program(self.tables)
@@ -218,7 +148,7 @@ class _Export:
         self.functions.append(_Function(head, words, CBody(program, list(zip(outputs, nodes, strict=True)))))
 
     @property
-    def _of_world(self) -> list[tuple[_Field, str]]:
+    def _of_world(self) -> list[tuple[Field, str]]:
         return [(field, "world->") for field in self.fields]
 
     def _after(self) -> list[str]:
@@ -226,14 +156,14 @@ class _Export:
 
     def _add_shield(self) -> None:
         self._add(
-            self._start,
+            self.start,
             "void sidestep_start(const sidestep_world *world, sidestep_memory *memory)",
             "The memory before the first call of sidestep_filter.",
             self._of_world,
             self._after(),
         )
         self._add(
-            self._filter,
+            self.filtered,
             "void sidestep_filter(const sidestep_world *world, const float wish[2],\n"
             "                     sidestep_memory *memory, sidestep_answer *answer)",
             "The safe velocity for a nominal one, `wish`, in m/s. Call it once in every control period.",
@@ -245,7 +175,7 @@ class _Export:
         steps = decision_steps_of(self.policy)
         if self.what == "policy":
             self._add(
-                self._policy,
+                self.acted,
                 f"void sidestep_policy(const float observation[{self.seen.size}], float action[2])",
                 "The policy's action in [-1, 1] x [-1, 1] for an observation.",
                 [(self.seen, "")],
@@ -253,7 +183,7 @@ class _Export:
             )
             return
         self._add(
-            self._wish,
+            self.wished,
             "void sidestep_wish(const sidestep_world *world, float wish[2])",
             f"The policy's velocity in m/s. It was trained to decide in every {steps}th period: keep `wish`\n"
             "   in between.",
@@ -283,13 +213,13 @@ class _Export:
             lines += ["/* Control periods between two decisions of the policy. */"]
             lines += [f"#define SIDESTEP_DECISION_STEPS {decision_steps_of(self.policy)}"]
         if self.what != "policy":
-            members = [field.declaration for field in self.used] or ["    char none;"]
+            members = [_declaration(field) for field in self.used] or ["    char none;"]
             lines += ["", "typedef struct {", *members, "} sidestep_world;"]
             lines += ["", "/* What the shield keeps from call to call. */", "typedef struct {"]
-            lines += [field.declaration for field in self.memory] or ["    char none;"]
+            lines += [_declaration(field) for field in self.memory] or ["    char none;"]
             lines += ["} sidestep_memory;", "", "typedef struct {"]
-            lines += [_Field("velocity", (2,), "f", "m/s").declaration]
-            lines += [_Field("status", (), "i", STATUS_WORDS).declaration, "} sidestep_answer;"]
+            lines += [_declaration(Field("velocity", (2,), "f", "m/s"))]
+            lines += [_declaration(Field("status", (), "i", STATUS_WORDS)), "} sidestep_answer;"]
         for function in self.functions:
             lines += ["", f"/* {function.words} */", f"{function.head};"]
         return "\n".join([*lines, "", "#endif", ""])
@@ -384,9 +314,9 @@ class _Export:
         state, rng = random_states(self.scenario, count, 0), np.random.default_rng(1)
         if self.what == "policy":
             world = [state[field.name] for field in self.fields]
-            seen = jax.jit(jax.vmap(lambda *values: observe(self.scenario, self._world(*values))))
+            seen = jax.jit(jax.vmap(lambda *values: observe(self.scenario, World(*values))))
             inputs = [np.asarray(seen(*world), np.float32)]
-            found, allowed = answers(self._policy, inputs, measured=1, loose=2, seed=2)
+            found, allowed = answers(self.acted, inputs, measured=1, loose=2, seed=2)
             return self._rows(inputs, found, allowed, 2)
         memory = [
             rng.integers(-1, 2, (count, *field.shape)).astype(KINDS[field.kind]) for field in self.memory
@@ -400,13 +330,13 @@ class _Export:
         shown = [state[field.name] for field in self.used]
         if self.what == "filter":
             found, allowed = answers(
-                self._filter, [*world, state["wish"], *memory], measured=n + 1, loose=2, seed=2
+                self.filtered, [*world, state["wish"], *memory], measured=n + 1, loose=2, seed=2
             )
             return self._rows([*shown, state["wish"], *memory], found, allowed, 2)
 
         def both(*values: Any) -> tuple[Any, ...]:
-            (wish,) = self._wish(*values[:n])
-            return (wish, *self._filter(*values[:n], wish, *values[n:]))
+            (wish,) = self.wished(*values[:n])
+            return (wish, *self.filtered(*values[:n], wish, *values[n:]))
 
         found, allowed = answers(both, [*world, *memory], measured=n, loose=4, seed=2)
         return self._rows([*shown, *memory], found, allowed, 4)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import sidestep
+from sidestep.safety import Shield
 from sidestep.store.files import write_bytes
 from sidestep.world import Scenario
 from sidestep.world.loading import scenario_to_dict
@@ -28,6 +29,16 @@ def check_what(scenario: Scenario, what: str, policy: object | None) -> None:
         raise ValueError(f"exporting {what!r} needs a policy")
     if what != "policy":
         scenario.check_built_in("an exported filter", ALONE)
+
+
+def check_looks_ahead(shield: Shield, name: str, format: str) -> None:
+    """**Raises** `ValueError` for a shield that looks ahead, which `format` does not hold."""
+    if shield.looks_ahead:
+        named = f"the shield {name!r}" if name else "this shield"
+        raise ValueError(
+            f"{named} looks ahead here, thousands of simulated steps per decision: that is not exported as "
+            f"{format}. Take 'joint:table', which goes by the clearance table alone, or 'game' (--shield)"
+        )
 
 
 def write_new(path: str | Path, content: bytes, *, overwrite: bool) -> Path:

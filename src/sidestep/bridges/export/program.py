@@ -157,14 +157,14 @@ class Program:
                 stage = max(stage, self._array_since(about) + 1)
             inputs = node.inputs = tuple(self._at(one, stage) for one in inputs)
             loop = self._loop(node.size, stage)
-            key = (operation, inputs, kind, about, stage)
+            key = (operation, _alike(operation, inputs), kind, about, stage)
             if key in self.block.known:
                 return self.block.known[key]
             node.block, node.loop, node.stage = self.block, loop, stage
             loop.nodes.append(node)
             self.block.known[key] = node
             return node
-        key = (operation, inputs, kind, about)
+        key = (operation, _alike(operation, inputs), kind, about)
         block: Block | None = self.block
         while block is not None:
             if key in block.known:
@@ -307,6 +307,11 @@ class Program:
             made.loop.nodes.append(made)
             self.block.known[key] = made
         return self.block.known[key]
+
+
+def _alike(operation: str, inputs: tuple[Node, ...]) -> Any:
+    """The inputs, in no order where it makes no difference, not even to the sign of a zero."""
+    return frozenset(inputs) if operation in ("add", "mul", "and", "or", "eq", "ne") else inputs
 
 
 def live(program: Program, outputs: list[Node]) -> set[Any]:

@@ -569,7 +569,7 @@ class _Translator:
         shape = (1,) * (len(value.shape) - 1) + tuple(np.delete(weights.shape, along))
         if isinstance(value, Looped):
             array = self._array(value.nodes.reshape(-1)[0], n)
-        elif n >= LONG:
+        elif max(n, columns) >= LONG:
             array = self.program.store(list(enumerate(self.nodes(value).reshape(-1))), "f", n)
         else:
             array = None

@@ -202,12 +202,12 @@ def _together(certificate: Certificate) -> list[Claim]:
         f"Pursuer and one obstacle together: an evader outside the capture set of "
         f"{found.game.capture_distance:.6g} m (h' >= 0, design angle {math.degrees(found.game.angle):.3g} "
         f"deg) that has every obstacle's centre farther than "
-        f"{found.beyond:.3g} m away stays free of both {lasting}, deciding every "
+        f"{found.beyond:.3g} m away can stay free of both {lasting}, deciding every "
         f"{found.game.control_period:g} s on exact measurements, while the obstacle drifts at up to "
         f"{found.drift:.3g} m/s in any direction. Nearer ones matter by direction and h': most, "
         f"{worst.worst:.3g} m at h' = {worst.height:g} m, where the obstacle lies "
         f"{abs(math.degrees(worst.towards)):.0f} deg off the pursuer's axis. From a table solved on a grid "
-        "and interpolated, with spare drift for what that loses; not bounded between its nodes."
+        "and interpolated, with spare drift for what that loses."
     )
     claims = [Claim(COMPUTED, text)]
     if found.checked is not None:
@@ -230,8 +230,13 @@ def _together(certificate: Certificate) -> list[Claim]:
         "How often an evader behind `joint` is lost to given pursuers and to the table's own worst case: "
         "`sidestep falsify` counts that."
     )
+    between = (
+        "What lies between the table's nodes. Where an obstacle lies dead ahead of the pursuer, the distance "
+        "that it must have jumps within a degree, and an evader that goes by the table alone (`joint:table`) "
+        "is led there and lost now and then. `joint` looks ahead there, which is measured, not certified."
+    )
     closer = "Obstacles that stand closer to each other than that, or to a wall."
-    claims += [Claim(MEASURED, measured), Claim(NOT_CLAIMED, closer)]
+    claims += [Claim(MEASURED, measured), Claim(NOT_CLAIMED, between), Claim(NOT_CLAIMED, closer)]
     if found.seconds is not None:
         later = f"That an evader that keeps the table's set now still can in {found.seconds:.3g} s."
         claims.append(Claim(NOT_CLAIMED, later))
