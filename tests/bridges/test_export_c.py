@@ -116,24 +116,48 @@ def test_the_python_check_says_the_same(exported):
     assert "3000 states: 0 differ" in done.stdout
 
 
-def test_joint_by_its_table_answers_as_in_jax_as_an_onnx_graph_too(compiler, tmp_path):
-    scenario = load_scenario("paper")
+@pytest.fixture(scope="module")
+def by_table(tmp_path_factory):
+    """The shield `joint:table`, 1,000 states."""
+    folder, scenario = tmp_path_factory.mktemp("table"), load_scenario("paper")
     shield = make_shield("joint:table", scenario)
-    export_c(tmp_path, scenario, None, what="filter", shield=shield, shield_name="joint:table", states=1000)
-    status, said = checked(compiler, tmp_path, "-O0")
+    export_c(folder, scenario, None, what="filter", shield=shield, shield_name="joint:table", states=1000)
+    return folder
+
+
+def test_joint_by_its_table_answers_as_in_jax(compiler, by_table):
+    status, said = checked(compiler, by_table, "-O0")
     assert status == 0, said
     assert "1000 states: 0 differ" in said
     # Constants in 16 bits, as the table has them.
-    code = (tmp_path / "sidestep.c").read_text()
+    code = (by_table / "sidestep.c").read_text()
     assert "static const uint16_t" in code
     assert "malloc" not in code
 
+
+def test_the_app_of_a_crazyflie_arrives_past_pursuer_and_obstacle(compiler, by_table, tmp_path):
+    example = ROOT / "examples" / "crazyflie"
+    sources = [example / "src" / "evader.c", example / "rehearsal" / "rehearsal.c", by_table / "sidestep.c"]
+    folders = ["-I", example / "rehearsal", "-I", by_table]
+    flags = ["-std=gnu99", "-Wall", "-Wextra", "-Werror", "-O1"]
+    subprocess.run([compiler, *flags, *folders, *sources, "-o", tmp_path / "fly", "-lm"], check=True)
+    done = subprocess.run([tmp_path / "fly"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.startswith("arrived after")
+    # Without poses for half a second it stops.
+    blind = subprocess.run([tmp_path / "fly", "blind"], capture_output=True, text=True, check=False)
+    assert "at most 0.0000 m/s while unseen" in blind.stdout
+
+
+def test_an_onnx_graph_of_joint_by_its_table_answers_as_in_jax(by_table, tmp_path):
+    scenario = load_scenario("paper")
+    shield = make_shield("joint:table", scenario)
     ort = pytest.importorskip("onnxruntime")
     path = tmp_path / "filter.onnx"
     export_onnx(path, scenario, None, what="filter", shield=shield, shield_name="joint:table")
     session = ort.InferenceSession(path, providers=["CPUExecutionProvider"])
-    _, inputs, outputs = np.fromfile(tmp_path / "states.bin", "<u4", 4)[1:]
-    rows = np.fromfile(tmp_path / "states.bin", "<f4", offset=20).reshape(1000, inputs + outputs + 1)
+    _, inputs, outputs = np.fromfile(by_table / "states.bin", "<u4", 4)[1:]
+    rows = np.fromfile(by_table / "states.bin", "<f4", offset=20).reshape(1000, inputs + outputs + 1)
     state, at = {}, 0
     for given in session.get_inputs():
         shape = given.shape[1:]
