@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -107,6 +107,7 @@ def table(name: str, values: np.ndarray) -> list[str]:
     return [*lines, line, "};"]
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class CBody:
     """The statements of a function that leaves the `outputs`, (where, node), of a program."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -16,6 +16,7 @@ ELEMENTS = {"f": 1, "u": 2, "i": 6, "b": 9}
 """ONNX's numbers for float, uint8, int32 and bool."""
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class Graph:
     """Nodes in the order in which they are computed; tensors go by their names. Equal nodes and equal
     constants are there once."""

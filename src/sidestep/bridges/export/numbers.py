@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from graphlib import TopologicalSorter
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -15,6 +15,7 @@ CHAINS = ("add", "min", "max", "and", "or")
 """Operations of any number of inputs."""
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class Numbers:
     """The nodes of a program on which `outputs` depend, in an `order` in which each comes after those that it
     needs. A condition is a choice between what its branches return; a chain of sums, or of least or largest,

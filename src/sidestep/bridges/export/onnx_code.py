@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -58,6 +58,7 @@ def write_numbers(
     _Writer(graph, numbers, find_packs(numbers, cost), used).write(outputs)
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class _Writer:
     """Writes numbers into a graph; those of a pack share a node."""
 

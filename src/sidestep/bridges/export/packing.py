@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, no_type_check
 
 from sidestep.bridges.export.numbers import Numbers
 from sidestep.bridges.export.program import Node
@@ -30,6 +30,7 @@ def find_packs(numbers: Numbers, cost: Callable[[Sequence[Pack]], float]) -> lis
     return _Search(numbers, cost).run()
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class _Search:
     def __init__(self, numbers: Numbers, cost: Callable[[Sequence[Pack]], float]):
         self.numbers, self.cost_of = numbers, cost

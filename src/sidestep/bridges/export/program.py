@@ -11,7 +11,7 @@ array. Equal numbers are one node, and what depends on constants only is compute
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -106,6 +106,7 @@ class Tables:
         return self._seen[id(array)][1]
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class Program:
     """Builds a program: every method returns the node of what it names, in the block that is open."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, no_type_check
 
 import jax
 import numpy as np
@@ -58,6 +58,7 @@ def _is_known(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype != object
 
 
+@no_type_check  # called millions of times: checking types would take the tests a minute
 class _Translator:
     def __init__(self, program: Program):
         self.program = program
