@@ -115,7 +115,7 @@ class Answering:
         self._parts = [
             self._numbers[cut].reshape(shape) for cut, shape in zip(self._cuts, self.shapes, strict=True)
         ]
-        self._count = m + k
+        self._count, self.size = m + k, 8 + m + k
         self._programs: dict[str, Callable[..., Any]] = {}
 
     def start(self, world: Estimate) -> Any:

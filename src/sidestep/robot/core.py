@@ -39,8 +39,8 @@ class Onboard:
 
     **Arguments:** `shield` a name, or a shield of this scenario (its budget then replaces that of the
     settings); `policy` None if the caller passes nominal velocities, `goal-seeking`, a run folder, or any
-    policy; `answering` makes them into calls: by JAX, or by `sidestep.bridges.export.CompiledAnswering`, in C
-    where that agrees.
+    policy; `answering` makes them into calls, by JAX, or with `sidestep.bridges.compiled.CompiledAnswering`
+    by compiled C where that agrees.
 
     **Reactions to faults.**
 
