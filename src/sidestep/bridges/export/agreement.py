@@ -29,9 +29,9 @@ def agreement(native: Callable[..., Any], answering: Answering, memory: Any) -> 
 
     - `why`: what is wrong with it, empty if nothing is
     - `states`, of which it `decided` so many without a look-ahead; `compared` are those of them in which no
-      rounding error decides between two answers, `rough` those in which a square root makes up to 3e-3 m/s of
-      one. Where a number is not finite, or larger than the decision core lets through, only velocities, status
-      and whole numbers of the memory are compared
+      rounding error decides between two answers, `rough` those in which a square root makes up to 3e-3 m/s
+      of one. Where a number is not finite, or larger than the decision core lets through, only velocities,
+      status and whole numbers of the memory are compared
     - `microseconds`, `microseconds in JAX`: medians of whole calls
     """
     leaves, structure = jax.tree.flatten(memory)
