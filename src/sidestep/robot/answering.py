@@ -35,16 +35,10 @@ class Estimate(NamedTuple):
 
     def world(self) -> World:
         """The estimate as a `World`."""
+        dtype = jax.dtypes.canonicalize_dtype(float)
         with np.errstate(over="ignore"):  # As in `Answering`.
-            return World(
-                self.evader,
-                self.pursuers,
-                self.obstacles,
-                self.target,
-                np.float64(self.time),
-                evader_velocity=self.velocity,
-                wheel_speeds=self.wheel_speeds,
-            )
+            *parts, velocity, wheel_speeds, time = (np.asarray(part, dtype) for part in self)
+        return World(*parts, time, velocity, wheel_speeds)
 
 
 class Answer(NamedTuple):
