@@ -77,8 +77,8 @@ class CompiledAnswering:
 class _Memory(NamedTuple):
     """A memory as a library writes it: to make a pytree of it takes a microsecond or two."""
 
-    words: Numbers
-    tree: Callable[[Numbers], Any]
+    words: np.ndarray
+    tree: Callable[[np.ndarray], Any]
 
 
 def as_tree(memory: Any) -> Any:
@@ -110,28 +110,28 @@ class Native:
         self._outputs = self._words[len(numbers) + count :]
         self._address = self._words.ctypes.data
 
-    def __call__(self, numbers: Numbers, memory: Any) -> tuple[Numbers, bool, Any]:
+    def __call__(self, numbers: Numbers, memory: Any) -> tuple[np.ndarray, bool, Any]:
         """The answer's vector, whether it needs no look-ahead (else all is void), and the next memory, of
         which `as_tree` makes a pytree."""
         self._numbers[:] = numbers
         self._before[:] = memory.words if isinstance(memory, _Memory) else self._flat(memory)
         self._decide(self._address)
         found, size = self._outputs.copy(), self._size
-        return found[:size], found[size] != 0.0, _Memory(found[size + 1 :], self._tree)
+        return found[:size], bool(found[size]), _Memory(found[size + 1 :], self._tree)
 
-    def with_pytree(self, numbers: Numbers, memory: Any) -> tuple[Numbers, bool, Any]:
+    def with_pytree(self, numbers: Numbers, memory: Any) -> tuple[np.ndarray, bool, Any]:
         """The same, with the next memory as a pytree."""
         vector, decided, after = self(numbers, memory)
         return vector, decided, as_tree(after)
 
-    def _flat(self, memory: Any) -> Numbers:
+    def _flat(self, memory: Any) -> np.ndarray:
         words = [np.zeros(0, np.float32)]
         for leaf in map(np.asarray, jax.tree.leaves(memory)):
             word = np.float32 if leaf.dtype.kind == "f" else np.int32
             words.append(leaf.reshape(-1).astype(word).view(np.float32))
         return np.concatenate(words)
 
-    def _tree(self, words: Numbers) -> Any:
+    def _tree(self, words: np.ndarray) -> Any:
         leaves, at = [], 0
         for like in self._like:
             leaf = words[at : at + like.size].reshape(like.shape)
