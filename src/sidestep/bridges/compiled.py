@@ -160,17 +160,19 @@ def compiled(answering: Answering, numbers: Numbers, memory: Any) -> Native | No
 def _built(answering: Answering, numbers: Numbers, memory: Any, place: Path | None) -> Native | None:
     # Not before: it takes a sixth of a second, and a library that was kept needs none of it.
     from sidestep.bridges.export.agreement import agreement
-    from sidestep.bridges.export.library import build, c_code
+    from sidestep.bridges.export.library import build, c_code, compiler
     from sidestep.bridges.export.program import NotTranslatable
 
     begun, native, library = time.perf_counter(), None, b""
+    if (program := compiler()) is None:
+        return _without("there is no C compiler cc; install one, such as gcc, or name yours in CC")
     try:
         code = c_code(*_flat_program(answering, numbers, memory))
     except NotTranslatable as error:
         verdict: dict[str, Any] = {"why": str(error)}
     else:
         with tempfile.TemporaryDirectory(prefix="sidestep-") as scratch:
-            path, why = build(Path(scratch), code)
+            path, why = build(Path(scratch), code, program)
             if path is None:
                 # Not kept: a compiler can be installed.
                 return _without(why)

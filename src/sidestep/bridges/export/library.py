@@ -49,12 +49,13 @@ def c_code(function: Callable[..., tuple[Any, ...]], *examples: Any) -> str:
     return "\n".join([*lines, *body.lines(), "}", ""])
 
 
-def build(folder: Path, code: str) -> tuple[Path | None, str]:
+def compiler() -> str | None:
+    """The path of the C compiler: `$CC`, or `cc`; None without one."""
+    return shutil.which(os.environ.get("CC", "cc"))
+
+
+def build(folder: Path, code: str, compiler: str) -> tuple[Path | None, str]:
     """The library, or None and why there is none."""
-    asked = os.environ.get("CC", "cc")
-    compiler = shutil.which(asked)
-    if compiler is None:
-        return None, f"there is no C compiler {asked!r}; install one, such as gcc, or set CC"
     source, library = folder / "decide.c", folder / "decide.so"
     source.write_text(code, encoding="ascii")
     try:
