@@ -127,7 +127,7 @@ def _decisions(settings: dict[str, Any]) -> dict[str, Any]:
     shield = make_shield(settings["shield"].partition(",")[0], scenario, budget)
     answering = (CompiledAnswering if settings["how"] == "compiled C" else Answering)(shield, None)
 
-    def seen(world: Any) -> tuple[Any, np.ndarray]:
+    def seen(world: Any) -> tuple[Any, Any]:
         ahead = jnp.asarray(AHEAD, world.evader.dtype)
         return world, to_velocity(scenario, world, ahead)
 

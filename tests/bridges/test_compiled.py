@@ -183,6 +183,31 @@ def test_what_cannot_be_translated_is_left_to_jax(tmp_path, monkeypatch, caplog)
     np.testing.assert_array_equal(answer.nominal, 0.0)
 
 
+class Ahead(Shield):
+    """Does not know beforehand whether it looks ahead."""
+
+    scenario: Scenario
+
+    @property
+    def rows_only(self):
+        return GameShield(self.scenario)
+
+    def init(self, world):
+        return self.rows_only.init(world)
+
+    def __call__(self, world, nominal, memory):
+        return self.rows_only(world, nominal, memory)
+
+
+def test_a_shield_that_has_to_look_ahead_is_left_to_jax(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(programs, "folder", lambda: tmp_path / "sidestep")
+    answering = CompiledAnswering(Ahead(SCENARIO), None)
+    answer, _ = answering(SEEN, NOMINAL, False, False, 0.0, answering.start(SEEN))
+    assert not answering.compiled
+    assert "has to look ahead" in notes(caplog)[0]
+    np.testing.assert_allclose(answer.action, NOMINAL, atol=1e-7)
+
+
 def test_in_double_precision_jax_decides(x64, caplog):
     answering = CompiledAnswering(make_shield("none", load_scenario("paper")), None)
     answering(SEEN, NOMINAL, False, False, 0.0, answering.start(SEEN))

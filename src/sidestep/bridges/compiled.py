@@ -236,6 +236,8 @@ def _keep(place: Path, library: bytes, verdict: dict[str, Any]) -> bool:
 def _flat_program(answering: Answering, numbers: Numbers, memory: Any) -> tuple[Any, ...]:
     """`answering.at_once` as a function of arrays, and example arguments: the input vector, then the memory.
     It returns the answer's vector, 1.0 where the answer needs no look-ahead, and the next memory."""
+    from sidestep.bridges.export.program import NotTranslatable
+
     leaves, structure = jax.tree.flatten(memory)
 
     def decide(numbers: Any, *leaves: Any) -> tuple[Any, ...]:

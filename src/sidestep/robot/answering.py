@@ -37,8 +37,9 @@ class Estimate(NamedTuple):
         """The estimate as a `World`."""
         dtype = jax.dtypes.canonicalize_dtype(float)
         with np.errstate(over="ignore"):  # As in `Answering`.
-            *parts, velocity, wheel_speeds, time = (np.asarray(part, dtype) for part in self)
-        return World(*parts, time, velocity, wheel_speeds)
+            evader, pursuers, obstacles, target, *still = (np.asarray(part, dtype) for part in self)
+        velocity, wheel_speeds, time = still
+        return World(evader, pursuers, obstacles, target, time, velocity, wheel_speeds)
 
 
 class Answer(NamedTuple):

@@ -16,11 +16,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jaxlib
+import jaxlib.version
 import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
+from sidestep._arrays import traced
 from sidestep.store.files import OutputError, write_bytes
 
 _MOST = 64
@@ -84,7 +85,7 @@ def _machine() -> tuple[str, ...]:
         processor = "".join(
             sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
         )
-    versions = (jax.__version__, jaxlib.__version__, eqx.__version__, np.__version__, sys.version)
+    versions = (jax.__version__, jaxlib.version.__version__, eqx.__version__, np.__version__, sys.version)
     return (*versions, platform.platform(), processor)
 
 
@@ -163,7 +164,7 @@ def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any) -> Any:
         arrays, fixed = eqx.partition(arguments, eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
-        if folder() is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if folder() is None or traced(leaves):
             return jitted(*arguments)
         digest = digest_of(name, fixed, [(leaf.shape, str(leaf.dtype)) for leaf in leaves])
         if digest is None:
