@@ -162,6 +162,16 @@ def test_a_library_that_answers_otherwise_is_never_used(built, tmp_path, monkeyp
     assert not list(folder.glob("*.so"))
 
 
+def test_an_error_of_any_kind_while_it_is_built_is_said_and_leaves_it_to_jax(cache, monkeypatch, caplog):
+    only(cache, ".json").unlink()
+    monkeypatch.setenv("CC", "cc")
+    monkeypatch.setattr(library, "c_code", lambda *given: {}["a bug"])
+    answering, answer = decided()
+    assert not answering.compiled
+    assert "KeyError: 'a bug'" in notes(caplog)[0]
+    np.testing.assert_allclose(answer.action, NOMINAL, atol=1e-7)
+
+
 def test_a_cache_that_cannot_be_written_costs_only_time(cache, tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
     monkeypatch.setattr(programs, "folder", lambda: tmp_path / "file" / "sidestep")

@@ -154,7 +154,11 @@ def compiled(answering: Answering, numbers: Numbers, memory: Any) -> Native | No
     place = None if folder is None or digest is None else folder / f"{digest}.json"
     if place is not None and (kept := _kept(place, numbers, memory, answering.size)) is not None:
         return kept.native if kept.native is not None else _without(kept.why)
-    return _built(answering, numbers, memory, place)
+    try:
+        return _built(answering, numbers, memory, place)
+    except Exception as error:
+        # Whatever it is, a robot that starts can still be guided by JAX.
+        return _without(f"{type(error).__name__}: {error}".splitlines()[0])
 
 
 def _built(answering: Answering, numbers: Numbers, memory: Any, place: Path | None) -> Native | None:
