@@ -23,8 +23,8 @@ class Bench:
     """Measure how fast this is, beside the peers that are installed. Run nothing else meanwhile."""
 
     sections: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SECTION ...]")] = ()
-    """Any of learning, many_worlds, filter, simulation, joint, roofline, scaling, gpu, startup; all by
-    default."""
+    """Any of learning, many_worlds, filter, simulation, joint, decision, roofline, scaling, gpu, startup;
+    all by default."""
     json: Annotated[Path | None, tyro.conf.arg(aliases=["--out"])] = None
     """Write the figures to this file; sections in it that do not run now stay as they are."""
     figures: Path | None = None

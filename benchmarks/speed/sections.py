@@ -11,6 +11,7 @@ SECTIONS = {
     "filter": "the filter against cbfpy, qpax, OSQP and Clarabel",
     "simulation": "many worlds at once against a loop over a Gymnasium environment",
     "joint": "how long one decision of the shield joint takes",
+    "decision": "one decision of a robot's core, in JAX and by compiled C",
     "roofline": "arithmetic of one update against the machine's rate for its matrix products",
     "scaling": "how seconds and memory grow with worlds, obstacles, pursuers, rows, episodes, seeds",
     "gpu": "what an accelerator does per second",

@@ -113,6 +113,10 @@ def real(value: object) -> Float[Array, "..."]:
     Constants become arrays rather than Python floats, so that `jit` traces them and another value never
     recompiles.
     """
+    if isinstance(value, (int, float, np.ndarray, np.generic)):
+        # NumPy converts it at once; JAX would compile a program for that.
+        with np.errstate(over="ignore"):
+            value = np.asarray(value, jax.dtypes.canonicalize_dtype(float))
     return jnp.asarray(value, dtype=float)
 
 

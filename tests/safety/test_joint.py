@@ -176,9 +176,10 @@ def _random_worlds(count, seed):
 
 @pytest.fixture(scope="module")
 def decided():
-    """Decisions in close worlds, made in one batch."""
+    """Decisions in close worlds, made in one batch; in every eighth the obstacle is far away."""
     scenario = load_scenario("paper")
     shield, worlds = JointShield(scenario, models=("turn-then-drive", "pure-pursuit")), _random_worlds(96, 0)
+    worlds = eqx.tree_at(lambda worlds: worlds.obstacles, worlds, worlds.obstacles.at[5::8, :, 0].add(5.0))
     rng = np.random.default_rng(1)
     nominal = jnp.asarray(rng.uniform(-0.15, 0.15, (96, 2)), float)
     act = eqx.filter_jit(jax.vmap(lambda world, nominal: shield(world, nominal, shield.init(world))))
@@ -275,6 +276,16 @@ def test_alone_a_robot_decides_as_it_does_in_a_batch(decided):
         np.testing.assert_allclose(alone.action, result.action[index], atol=2e-6)
         assert int(alone.status) == int(result.status[index])
         np.testing.assert_array_equal(kept.plan, memory.plan[index])
+
+
+def test_where_it_need_not_look_ahead_it_says_so_and_answers_the_same_at_once(decided):
+    _, shield, worlds, nominal, (result, memory) = decided
+    ask = jax.vmap(lambda world, nominal: shield.at_once(world, nominal, shield.init(world)))
+    *found, at_once = eqx.filter_jit(ask)(worlds, nominal)
+    np.testing.assert_array_equal(at_once, ~memory.looked)
+    assert 5 < np.sum(at_once) < len(at_once) - 5
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves([result, memory]), strict=True):
+        np.testing.assert_allclose(ours[at_once], theirs[at_once], atol=2e-6)
 
 
 @pytest.mark.slow

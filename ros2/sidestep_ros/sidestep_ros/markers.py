@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Duration
 from geometry_msgs.msg import Point, Vector3
 from std_msgs.msg import ColorRGBA
@@ -72,7 +73,7 @@ class Painter:
             ]
         for i, (x, y, *_) in enumerate(_rows(world.obstacles)):
             markers.append(self._line("collision distance", i, stamp, self._collision, (x, y)))
-        start = tuple(map(float, world.evader))
+        start = tuple(np.asarray(world.evader, float).tolist())
         markers.append(self._dot("evader", stamp, start))
         for name, velocity in (("nominal", decision.nominal), ("safe", decision.velocity)):
             markers.append(self._arrow(name, stamp, start, velocity))
@@ -129,4 +130,5 @@ class Painter:
 
 
 def _rows(array: Any) -> list[tuple[float, ...]]:
-    return [tuple(map(float, row)) for row in array]
+    # JAX would compile the iteration.
+    return [tuple(row) for row in np.asarray(array, float).tolist()]

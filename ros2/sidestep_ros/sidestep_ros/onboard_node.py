@@ -71,6 +71,17 @@ class OnboardNode(Node, abc.ABC):
     def make_onboard(self, settings: Any) -> Any:
         """The decision core of this node."""
 
+    @property
+    def answering(self) -> Any:
+        """What makes shield and policy into calls: compiled C, or JAX."""
+        if self.values["compiled"]:
+            from sidestep.bridges.compiled import CompiledAnswering
+
+            return CompiledAnswering
+        from sidestep.robot.answering import Answering
+
+        return Answering
+
     @abc.abstractmethod
     def listen(self) -> None:
         """Subscribe to topics other than poses."""
@@ -87,7 +98,9 @@ class OnboardNode(Node, abc.ABC):
         """Compile, then subscribe, so that nothing is compiled in callbacks."""
         from sidestep.world import scenario_to_dict
 
-        self.get_logger().info("compiling; commands follow when that is done")
+        self.get_logger().info(
+            "compiling; no command until that is done: the base has to stand still by itself"
+        )
         began = time.perf_counter()
         self._say("decisions", reports.WARN, "compiling, not ready", {})
         self.onboard.warm_up()

@@ -160,6 +160,7 @@ TOPICS = (
 
 DECIDING = (
     Parameter("shield", "joint", "Which shield filters.", choices=("paper", "game", "joint")),
+    Parameter("compiled", True, "Decide by compiled C, where there is a compiler and it agrees with JAX."),
     Parameter(
         "stamps",
         "header",

@@ -40,7 +40,9 @@ class PolicyNode(OnboardNode):
                 [f"'policy' is '{policy}', neither goal-seeking, pretrained nor a run's folder"]
             )
         shield = "none" if self.values["nominal_only"] else self.values["shield"]
-        return Onboard(self.scenario, shield=shield, policy=policy, settings=settings)
+        return Onboard(
+            self.scenario, shield=shield, policy=policy, settings=settings, answering=self.answering
+        )
 
     def listen(self) -> None:
         self._go_to(*self.values["target"])

@@ -24,7 +24,13 @@ class ShieldNode(OnboardNode):
     def make_onboard(self, settings: Any) -> Any:
         from sidestep.robot import Onboard
 
-        return Onboard(self.scenario, shield=self.values["shield"], policy=None, settings=settings)
+        return Onboard(
+            self.scenario,
+            shield=self.values["shield"],
+            policy=None,
+            settings=settings,
+            answering=self.answering,
+        )
 
     def listen(self) -> None:
         message_type = COMMAND_TYPES[self.values["command.type"]]

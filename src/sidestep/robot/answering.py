@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, Protocol, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sidestep._arrays import length, real
+from sidestep._arrays import length
 from sidestep.loop.step import decide
-from sidestep.safety import PursuitBarrier, Shield
+from sidestep.safety import PursuitBarrier, Shield, ShieldResult
 from sidestep.safety.shields.look_ahead import clearance
+from sidestep.store.programs import kept_program
 from sidestep.world import Scenario, World
 
 Numbers = Float[np.ndarray, "n"]
@@ -34,16 +35,11 @@ class Estimate(NamedTuple):
 
     def world(self) -> World:
         """The estimate as a `World`."""
+        dtype = jax.dtypes.canonicalize_dtype(float)
         with np.errstate(over="ignore"):  # As in `Answering`.
-            return World(
-                self.evader,
-                self.pursuers,
-                self.obstacles,
-                self.target,
-                np.float64(self.time),
-                evader_velocity=self.velocity,
-                wheel_speeds=self.wheel_speeds,
-            )
+            evader, pursuers, obstacles, target, *still = (np.asarray(part, dtype) for part in self)
+        velocity, wheel_speeds, time = still
+        return World(evader, pursuers, obstacles, target, time, velocity, wheel_speeds)
 
 
 class Answer(NamedTuple):
@@ -60,49 +56,18 @@ class Answer(NamedTuple):
     @classmethod
     def of(cls, vector: Numbers, count: int) -> Answer:
         """The answer from its concatenated parts, with `count` barriers."""
+        status, slack, intervention, clearance = vector[4:8].tolist()
         return cls(
-            nominal=vector[:2],
-            action=vector[2:4],
-            status=int(vector[4]),
-            slack=float(vector[5]),
-            intervention=float(vector[6]),
-            clearance=float(vector[7]),
-            barriers=vector[8 : 8 + count],
+            vector[:2], vector[2:4], int(status), slack, intervention, clearance, vector[8 : 8 + count]
         )
 
 
-@final
-class Answering:
-    """A shield and a policy compiled into one call with one input vector and one output vector.
+class Answers(Protocol):
+    """What the decision core asks: a shield and a policy, made into few calls."""
 
-    On small computers, passing many small arrays takes most of a decision's time.
-
-    `rows_only`: the shield decides by its rows, without looking ahead. The memory is the same.
-    """
-
-    def __init__(self, shield: Shield, policy: Callable[..., Any] | None, *, rows_only: bool = False):
-        scenario = shield.scenario
-        self._arrays, fixed = eqx.partition((shield, policy), eqx.is_array)
-        m, k = scenario.pursuer_count, scenario.obstacle_count
-        shapes = [(2,), (m, 3), (k, 4), (2,), (2,), (m, 2), (), (2,), (), (), ()]
-        split = ravel_pytree([jnp.zeros(shape, dtype=float) for shape in shapes])[1]
-        self._count = m + k
-
-        @jax.jit
-        def answer(arrays: Any, numbers: Array, memory: Any) -> tuple[Array, Any]:
-            shield, policy = eqx.combine(arrays, fixed)
-            parts = split(numbers)
-            evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
-            world = World(evader, pursuers, obstacles, target, time, velocity, wheels)
-            given, ask, flee, delay = parts[7:]
-            shield = shield.with_delay(delay)
-            nominal = _nominal(shield.scenario, policy, world, given, ask, flee)
-            result, memory = (shield.filter_by_rows if rows_only else shield)(world, nominal, memory)
-            outcome = [nominal, result.action, result.status.astype(nominal.dtype), result.slack]
-            outcome += [result.intervention, clearance(shield.scenario, world), result.barriers]
-            return jnp.concatenate([jnp.atleast_1d(part) for part in outcome]), memory
-
-        self._compiled = answer
+    def start(self, world: Estimate) -> Any:
+        """The shield's memory before the first call."""
+        ...
 
     def __call__(
         self, world: Estimate, given: Numbers, ask: bool, flee: bool, delay: float, memory: Any
@@ -112,12 +77,129 @@ class Answering:
         `given`: the nominal velocity (m/s) unless the policy decides (`ask`) or the robot flees (`flee`).
         `delay` (s) replaces the budget's.
         """
-        parts = (*world, given, ask, flee, delay)
-        numbers = np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in parts])
+        ...
+
+    def plan(self, world: Estimate, memory: Any) -> Float[np.ndarray, "n 2"]:
+        """Positions (m) along the shield's escape plan."""
+        ...
+
+
+@final
+class Answering:
+    """A shield and a policy compiled into one call with one input vector and one output vector.
+
+    On small computers, passing many small arrays takes most of a decision's time. Where JAX keeps compiled
+    programs, these are loaded without tracing (`sidestep.store.programs`).
+
+    `rows_only`: the shield decides by its rows, without looking ahead. The memory is the same.
+    """
+
+    def __init__(self, shield: Shield, policy: Callable[..., Any] | None, *, rows_only: bool = False):
+        self.shield, self.policy, self.rows_only = shield, policy, rows_only
+        arrays, self._fixed = eqx.partition((shield, policy), eqx.is_array)
+        leaves, self._structure = jax.tree.flatten(arrays)
+        self._leaves = [np.asarray(leaf) for leaf in leaves]
+        m, k = shield.scenario.pursuer_count, shield.scenario.obstacle_count
+        self.shapes = ((2,), (m, 3), (k, 4), (2,), (2,), (m, 2), (), (2,), (), (), ())
+        """Shapes of the parts of the input vector: an `Estimate`, then `given`, `ask`, `flee`, `delay`."""
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes]).tolist()
+        self._cuts = [slice(*cut) for cut in zip([0, *ends], ends, strict=False)]
+        self.flags = slice(self._cuts[8].start, self._cuts[9].stop)
+        """Where `ask` and `flee` are in the input vector."""
+        self._numbers = np.zeros(ends[-1], jax.dtypes.canonicalize_dtype(float))
+        self._parts = [
+            self._numbers[cut].reshape(shape) for cut, shape in zip(self._cuts, self.shapes, strict=True)
+        ]
+        self._count, self.size = m + k, 8 + m + k
+        self._programs: dict[str, Callable[..., Any]] = {}
+
+    def start(self, world: Estimate) -> Any:
+        return self._program("start", self.pack(world))
+
+    def __call__(
+        self, world: Estimate, given: Numbers, ask: bool, flee: bool, delay: float, memory: Any
+    ) -> tuple[Answer, Any]:
+        vector, memory = self.answer(self.pack(world, given, ask, flee, delay), memory)
+        return self.unpack(vector), memory
+
+    def plan(self, world: Estimate, memory: Any) -> Float[np.ndarray, "n 2"]:
+        return np.asarray(self._program("plan", self.pack(world), memory), float)
+
+    def answer(self, numbers: Numbers, memory: Any) -> tuple[Array, Any]:
+        """The answer's vector and the next memory, for the input vector."""
+        return self._program("answer", numbers, memory)
+
+    @property
+    def may_look_ahead(self) -> bool:
+        """Whether a decision may look ahead, which takes thousands of times as long."""
+        return self.shield.looks_ahead and not self.rows_only
+
+    def at_once(self, numbers: Array, memory: Any) -> tuple[Array, Any, Any] | None:
+        """What `answer` returns where it does not look ahead, for JAX to trace: the vector, whether it need
+        not look ahead, and the next memory. None if the shield does not know that beforehand."""
+        world, (given, ask, flee, delay) = self._split(numbers)
+        shield = self.shield.with_delay(delay)
+        nominal = _nominal(shield.scenario, self.policy, world, given, ask, flee)
+        if self.rows_only:
+            found = *shield.filter_by_rows(world, nominal, memory), jnp.ones((), bool)
+        elif (found := shield.at_once(world, nominal, memory)) is None:
+            return None
+        result, memory, decided = found
+        return _vector(shield.scenario, world, nominal, result), decided, memory
+
+    def pack(self, world: Estimate, *more: Any) -> Numbers:
+        """The input vector; what is not given is void."""
         with np.errstate(over="ignore"):  # An overflow to infinity gives a non-finite answer.
-            numbers = numbers.astype(real(0.0).dtype)
-        vector, memory = self._compiled(self._arrays, numbers, memory)
-        return Answer.of(np.asarray(vector, np.float64), self._count), memory
+            for place, part in zip(self._parts, (*world, *more), strict=False):
+                place[...] = part
+        return self._numbers.copy()
+
+    def unpack(self, vector: Any) -> Answer:
+        """The answer in a vector."""
+        return Answer.of(np.asarray(vector, np.float64), self._count)
+
+    def _program(self, name: str, numbers: Numbers, memory: Any = None) -> Any:
+        given = jax.tree.leaves(memory)
+        if name not in self._programs:
+            made, structure = getattr(self, f"_{name}"), jax.tree.structure(memory)
+
+            def flat(*arguments: Any) -> Any:
+                count = len(self._leaves)
+                arrays = jax.tree.unflatten(self._structure, arguments[:count])
+                shield, policy = eqx.combine(arrays, self._fixed)
+                memory = jax.tree.unflatten(structure, arguments[count + 1 :])
+                return made(shield, policy, arguments[count], memory)
+
+            about = (name, self._fixed, self.rows_only)
+            self._programs[name] = kept_program(about, flat, *self._leaves, numbers, *given)
+        return self._programs[name](*self._leaves, numbers, *given)
+
+    # As JAX traces them
+
+    def _start(self, shield: Shield, policy: Any, numbers: Array, memory: Any) -> Any:
+        return shield.init(self._split(numbers)[0])
+
+    def _plan(self, shield: Shield, policy: Any, numbers: Array, memory: Any) -> Any:
+        return shield.plan(self._split(numbers)[0], memory)
+
+    def _answer(self, shield: Shield, policy: Any, numbers: Array, memory: Any) -> Any:
+        world, (given, ask, flee, delay) = self._split(numbers)
+        shield = shield.with_delay(delay)
+        nominal = _nominal(shield.scenario, policy, world, given, ask, flee)
+        result, memory = (shield.filter_by_rows if self.rows_only else shield)(world, nominal, memory)
+        return _vector(shield.scenario, world, nominal, result), memory
+
+    def _split(self, numbers: Array) -> tuple[World, list[Array]]:
+        parts = [numbers[cut].reshape(shape) for cut, shape in zip(self._cuts, self.shapes, strict=True)]
+        evader, pursuers, obstacles, target, velocity, wheels, time = parts[:7]
+        return World(evader, pursuers, obstacles, target, time, velocity, wheels), parts[7:]
+
+
+def _vector(scenario: Scenario, world: World, nominal: Array, result: ShieldResult) -> Array:
+    """The parts of an `Answer`, concatenated."""
+    outcome = [nominal, result.action, result.status.astype(nominal.dtype), result.slack]
+    outcome += [result.intervention, clearance(scenario, world), result.barriers]
+    return jnp.concatenate([jnp.atleast_1d(part) for part in outcome])
 
 
 def _nominal(scenario: Scenario, policy: Any, world: World, given: Array, ask: Array, flee: Array) -> Array:

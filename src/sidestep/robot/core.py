@@ -9,17 +9,16 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.learning import load_policy
 from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.step import decision_steps_of
-from sidestep.robot.answering import Answering, Estimate, Numbers
+from sidestep.robot.answering import Answering, Answers, Estimate, Numbers
 from sidestep.robot.decision import LEVELS, Decision
 from sidestep.robot.estimates import Estimates
 from sidestep.robot.intake import Intake
@@ -40,7 +39,8 @@ class Onboard:
 
     **Arguments:** `shield` a name, or a shield of this scenario (its budget then replaces that of the
     settings); `policy` None if the caller passes nominal velocities, `goal-seeking`, a run folder, or any
-    policy.
+    policy; `answering` makes them into calls, by JAX, or with `sidestep.bridges.compiled.CompiledAnswering`
+    by compiled C where that agrees.
 
     **Reactions to faults.**
 
@@ -66,6 +66,8 @@ class Onboard:
         shield: str | Shield = "joint",
         policy: Any = None,
         settings: OnboardSettings | None = None,
+        *,
+        answering: Callable[..., Answers] = Answering,
     ):
         scenario.check_built_in(
             "the decision core", "give it the problem of the evader's control point, sidestep.safety.covered("
@@ -81,14 +83,16 @@ class Onboard:
             gained = settings.motor_acceleration * float(scenario.control_period)
             if gained < 2.0 * float(scenario.evader_speed):
                 shield = shield.with_acceleration(settings.motor_acceleration)
-        self._shield = shield
-        self._init = eqx.filter_jit(shield.init)
         if isinstance(policy, (str, Path)) and policy != GOAL_SEEKING:
+            # Not before: it takes a tenth of a second, and many cores have no such policy.
+            from sidestep.learning import load_policy
+
             policy = load_policy(policy)
         self._policy = None if policy is None else as_policy(policy, scenario)
         self._decision_steps = 1 if policy is None else decision_steps_of(self._policy)
-        self._whole = Answering(shield, self._policy)
-        self._rows = Answering(shield, self._policy, rows_only=True) if shield.looks_ahead else None
+        self._shield = shield
+        self._whole = answering(shield, self._policy)
+        self._rows = answering(shield, self._policy, rows_only=True) if shield.looks_ahead else None
         self._period = float(scenario.control_period)
         self._speed = float(scenario.evader_speed)
         self._target = np.full(2, np.nan) if policy is not None else np.zeros(2)
@@ -167,7 +171,7 @@ class Onboard:
         place = np.zeros(2)
         still = place, np.zeros((m, 2)), 0.0
         seen = Estimate(place, np.full((m, 3), 1.0), np.full((k, 4), 2.0), place + 1.0, *still)
-        memory = self._init(seen.world())
+        memory = self._whole.start(seen)
         self._whole(seen, place, True, False, 0.0, memory)
         if self._rows is not None:
             self._rows(seen, place, True, False, 0.0, memory)
@@ -204,7 +208,7 @@ class Onboard:
         level = max(level, int(lost))
         seen = self._estimate(acts)
         if self._memory is None:
-            self._memory = self._init(seen.world())
+            self._memory = self._whole.start(seen)
         delay = max(delay, float(self.settings.budget.delay)) + lateness
         ask = self._decided % self._decision_steps == 0
         flee = level >= LEVELS.index("evade")
@@ -233,7 +237,7 @@ class Onboard:
             latency=now - self._estimates.newest() + computed,
             compute_seconds=computed,
             _seen=seen,
-            _plan=lambda: np.asarray(self._shield.plan(seen.world(), memory), float),
+            _plan=lambda: self._whole.plan(seen, memory),
         )
 
     def _turned_back(self, now: float) -> list[str]:

@@ -9,12 +9,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sidestep._bounds import check
+from sidestep.store.programs import kept_jit
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
 from sidestep.world.field_names import ScenarioError, unknown_field, without_aliases
 from sidestep.world.flyers import Aircraft, Quadrotor
@@ -183,7 +183,7 @@ def _build(values: dict[str, Any]) -> Scenario:
     return scenario
 
 
-@eqx.filter_jit
+@kept_jit
 def _some_start_exists(scenario: Scenario) -> jax.Array:
     keys = jax.random.split(jax.random.key(0), 4096)
     return jnp.any(jax.vmap(lambda key: scenario.accepts(scenario._draw(key)))(keys))

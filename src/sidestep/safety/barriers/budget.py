@@ -11,6 +11,7 @@ import numpy as np
 from sidestep._arrays import Scalar, real, traced
 from sidestep._bounds import DELAY, DISTANCE, HEADING_ERROR, TRACKING_ERROR, check, within
 from sidestep.pursuit.game import CaptureGame
+from sidestep.store.programs import kept_jit
 from sidestep.world.scenario import Scenario
 
 
@@ -97,7 +98,7 @@ class Budget(eqx.Module):
         if traced((self, scenario)):
             return None
         self.check(scenario)
-        excess = float(np.asarray(self.excess(scenario)))
+        excess = float(np.asarray(_excess(self, scenario)))
         if not excess > 0.0:
             return None
         message = (
@@ -107,3 +108,8 @@ class Budget(eqx.Module):
         )
         warnings.warn(message, BudgetWarning, stacklevel=3)
         return message
+
+
+@kept_jit
+def _excess(budget: Budget, scenario: Scenario) -> Scalar:
+    return budget.excess(scenario)

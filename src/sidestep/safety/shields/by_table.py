@@ -129,23 +129,30 @@ class TableShield(Shield):
         self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
     ) -> tuple[ShieldResult, TableMemory]:
         nominal = jnp.asarray(nominal, world.evader.dtype)
-        result, after, kept = self._by_table(world, nominal, memory)
-        answer = result, after
+        result, waiting, decided = self.at_once(world, nominal, memory)
         if self.otherwise is None:
-            return answer
+            return result, waiting
         arrays, fixed = eqx.partition(self.otherwise, eqx.is_array)
-        # It begins anew each time.
-        waiting = eqx.tree_at(lambda part: part[1].otherwise, answer, self.otherwise.init(world))
 
         def ask(arrays: Any, world: World, nominal: Float[Array, "2"], memory: TableMemory) -> Any:
             result, after = eqx.combine(arrays, fixed)(world, nominal, memory.otherwise)
             return result, TableMemory(jnp.zeros_like(memory.turn), after)
 
         inputs = jax.lax.stop_gradient((arrays, world, nominal, memory))
-        gives_up = (self._is_crowded(world) | ~kept) & (answer[0].status != Status.INVALID)
-        result, after = masked_cond(ask, gives_up, jax.lax.stop_gradient(waiting), *inputs, width=4)
-        action = jnp.where(gives_up, result.action, answer[0].action)
-        return eqx.tree_at(lambda result: result.action, result, action), after
+        start = jax.lax.stop_gradient((result, waiting))
+        asked, after = masked_cond(ask, ~decided, start, *inputs, width=4)
+        action = jnp.where(decided, result.action, asked.action)
+        return eqx.tree_at(lambda result: result.action, asked, action), after
+
+    def at_once(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: TableMemory
+    ) -> tuple[ShieldResult, TableMemory, Flag]:
+        result, after, kept = self._by_table(world, jnp.asarray(nominal, world.evader.dtype), memory)
+        if self.otherwise is None:
+            return result, after, jnp.ones((), bool)
+        # It begins anew each time.
+        waiting = TableMemory(after.turn, self.otherwise.init(world))
+        return result, waiting, (kept & ~self._is_crowded(world)) | (result.status == Status.INVALID)
 
     def _is_crowded(self, world: World) -> Flag:
         """Whether a second obstacle or pursuer is near."""

@@ -178,16 +178,29 @@ class JointShield(Shield):
     def __call__(
         self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory
     ) -> tuple[ShieldResult, JointMemory]:
+        result, after, _ = self._decided(world, nominal, memory, look=True)
+        return result, after
+
+    def at_once(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory
+    ) -> tuple[ShieldResult, JointMemory, Flag]:
+        result, after, need = self._decided(world, nominal, memory, look=False)
+        return result, after, ~need
+
+    def _decided(
+        self, world: World, nominal: Float[AnyArray, "2"], memory: JointMemory, *, look: bool
+    ) -> tuple[ShieldResult, JointMemory, Flag]:
+        """The answer, the next memory, and whether it needs a look-ahead, which it takes with `look`."""
         kept = with_margins(self.scenario, self.budget)
         nominal = jnp.asarray(nominal, world.evader.dtype)
         turn = still_turned(kept, world, nominal, memory.turn)
-        result, after, accepted = self._filtered(world, nominal, turn, memory)
+        result, after, accepted, need = self._filtered(world, nominal, turn, memory, look=look)
         # Where the look-ahead rejects the action, the evader is not stuck behind an obstacle.
         moved_on = ~accepted | (result.status == Status.INVALID)
         towards_pursuers = result.barriers[: self.scenario.pursuer_count]
         turn = next_turn(kept, world, nominal, result.action, turn, towards_pursuers)
-        turn = jnp.where(moved_on, 0.0, turn)
-        return result, eqx.tree_at(lambda memory: memory.turn, after, turn.astype(memory.turn.dtype))
+        turn = jnp.where(moved_on, 0.0, turn).astype(memory.turn.dtype)
+        return result, eqx.tree_at(lambda memory: memory.turn, after, turn), need
 
     def rows(self, world: World, memory: JointMemory) -> BarrierRows:
         return self.rows_only.rows(world, memory.sides)
@@ -212,16 +225,17 @@ class JointShield(Shield):
         return dataclasses.replace(self, acceleration=acceleration)
 
     def _filtered(
-        self, world: World, nominal: Float[Array, "2"], turn: Scalar, memory: JointMemory
-    ) -> tuple[ShieldResult, JointMemory, Flag]:
-        """The answer to a nominal action that is turned aside by `turn`, the next memory, and whether that
-        action was accepted."""
+        self, world: World, nominal: Float[Array, "2"], turn: Scalar, memory: JointMemory, *, look: bool
+    ) -> tuple[ShieldResult, JointMemory, Flag, Flag]:
+        """The answer to a nominal action that is turned aside by `turn`, the next memory, whether that action
+        was accepted, and whether it needs a look-ahead. Without `look` the rest is void where it does."""
         game = self.rows_only
         greedy, sides = game(world, turned(nominal, turn), memory.sides)
         greedy = as_changed(greedy, nominal, turn != 0.0)
         m = self.scenario.pursuer_count
         if m == 0 or m + self.scenario.obstacle_count == 1:
-            return greedy, eqx.tree_at(lambda memory: memory.sides, memory, sides), jnp.ones((), bool)
+            after = eqx.tree_at(lambda memory: memory.sides, memory, sides)
+            return greedy, after, jnp.ones((), bool), jnp.zeros((), bool)
         # The rows towards the nearest pursuer can be kept alone; with anything beside it they may not.
         towards_pursuers = jnp.sort(greedy.barriers[:m])
         far = 1.0 if self.acceleration is None else jnp.where(memory.looked, _LEAVE, 1.0)
@@ -242,23 +256,16 @@ class JointShield(Shield):
         wheels = jnp.stack([pursue(self.scenario, model, world, key) for model in models])
         # A robot that reaches every velocity at once can change sides and back at no cost.
         held = sides if self.acceleration is None else memory.sides
-        inputs = _Inputs(
-            world, memory, greedy.action, sides, held, wheels, live, jax.random.fold_in(key, memory.calls)
-        )
-        decision = self._look(need, inputs)
-
-        choice = choice_at(decision.plan, decision.age, self.horizon / SEGMENTS)
-        planned = chosen_velocity(self.scenario, world, held, choice)
-        evasive, evasive_sides = game(world, planned, held)
-        wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
-        evasive = eqx.tree_at(
-            lambda result: (result.status, result.intervention),
-            evasive,
-            (jnp.maximum(evasive.status, Status.CORRECTED), correction(evasive.action, wanted)),
-        )
-        result = select(decision.accept, greedy, evasive)
+        idle = _Decision(~need, memory.plan, memory.age, jnp.zeros((), bool), jnp.zeros_like(memory.pause))
+        if look:
+            next_key = jax.random.fold_in(key, memory.calls)
+            inputs = _Inputs(world, memory, greedy.action, sides, held, wheels, live, next_key)
+            decision = self._look(need, idle, inputs)
+            result, sides = self._followed(decision, inputs, greedy, nominal)
+        else:
+            decision, result = idle, greedy
         after = JointMemory(
-            jnp.where(decision.accept, sides, evasive_sides),
+            sides,
             decision.plan,
             decision.age + self.scenario.control_period,
             need & decision.clear,
@@ -269,15 +276,29 @@ class JointShield(Shield):
             need,
             turn,
         )
-        return result, after, decision.accept
+        return result, after, decision.accept, need
 
-    def _look(self, need: Flag, inputs: _Inputs) -> _Decision:
+    def _followed(
+        self, decision: _Decision, inputs: _Inputs, greedy: ShieldResult, nominal: Float[Array, "2"]
+    ) -> tuple[ShieldResult, Float[Array, "m"]]:
+        """The answer and the sides: those of the accepted action (`greedy`), or of the escape plan."""
+        choice = choice_at(decision.plan, decision.age, self.horizon / SEGMENTS)
+        planned = chosen_velocity(self.scenario, inputs.world, inputs.held, choice)
+        evasive, evasive_sides = self.rows_only(inputs.world, planned, inputs.held)
+        wanted = jnp.where(jnp.all(jnp.isfinite(nominal)), nominal, 0.0)
+        evasive = eqx.tree_at(
+            lambda result: (result.status, result.intervention),
+            evasive,
+            (jnp.maximum(evasive.status, Status.CORRECTED), correction(evasive.action, wanted)),
+        )
+        sides = jnp.where(decision.accept, inputs.sides, evasive_sides)
+        return select(decision.accept, greedy, evasive), sides
+
+    def _look(self, need: Flag, idle: _Decision, inputs: _Inputs) -> _Decision:
         """Whether the action is accepted, and the escape plan to hold or else to follow."""
         arrays, fixed = eqx.partition(self, eqx.is_array)
         arrays, inputs = jax.lax.stop_gradient((arrays, inputs))
         memory = inputs.memory
-        nothing = jnp.zeros_like(memory.pause)
-        idle = _Decision(~need, memory.plan, memory.age, jnp.zeros((), bool), nothing)
 
         def confirm(arrays: Any, inputs: _Inputs) -> _Decision:
             holds = eqx.combine(arrays, fixed)._confirm(inputs)

@@ -84,6 +84,15 @@ class Shield(eqx.Module):
         """The call without looking ahead, by the rows alone, for a robot that is short of time."""
         return self(world, nominal, memory)
 
+    def at_once(
+        self, world: World, nominal: Float[AnyArray, "2 *lanes"], memory: Any
+    ) -> tuple[ShieldResult, Any, Flag] | None:
+        """What the call returns where it need not look ahead, and whether it need not. None for a shield that
+        does not know this beforehand."""
+        if self.looks_ahead:
+            return None
+        return *self(world, nominal, memory), jnp.ones((), bool)
+
     def has_plan(self, memory: Any) -> Flag:
         """Whether it holds or follows an escape plan now, because it has looked ahead."""
         return jnp.zeros((), bool)
