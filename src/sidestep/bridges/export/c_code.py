@@ -39,6 +39,18 @@ static inline int32_t quotient(int32_t a, int32_t b)
 {
     return b == 0 ? -1 : b == -1 ? minus(0, a) : a / b;
 }
+static inline int32_t left(int32_t a, int32_t b) { return (int32_t)((uint32_t)a << b); }
+static inline int32_t right(int32_t a, int32_t b) { return (int32_t)((uint32_t)a >> b); }
+static inline float real_of(int32_t a)
+{
+    const union { int32_t whole; float real; } bits = {a};
+    return bits.real;
+}
+static inline int32_t bits_of(float a)
+{
+    const union { float real; int32_t whole; } bits = {a};
+    return bits.whole;
+}
 static inline int32_t sign_i(int32_t a) { return (a > 0) - (a < 0); }
 static inline float sign(float a) { return a > 0.0f ? 1.0f : a < 0.0f ? -1.0f : a; }
 static inline int32_t whole(float a)
@@ -53,6 +65,7 @@ _OPERATIONS = {
         "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "neg": "(-{})",
         "min": "least({}, {})", "max": "most({}, {})", "abs": "fabsf({})", "sign": "sign({})",
         "rem": "fmodf({}, {})", "pow": "powf({}, {})", "atan2": "atan2f({}, {})",
+        "bits": "real_of({})",
     }
     | {
         name: f"{name}f({{}})"
@@ -65,7 +78,7 @@ _OPERATIONS = {
         "add": "plus({}, {})", "sub": "minus({}, {})", "mul": "times({}, {})", "min": "least_i({}, {})",
         "max": "most_i({}, {})", "rem": "rest({}, {})", "div": "quotient({}, {})", "abs": "size({})",
         "neg": "minus(0, {})", "sign": "sign_i({})", "not": "(~{})", "and": "({} & {})", "or": "({} | {})",
-        "xor": "({} ^ {})",
+        "xor": "({} ^ {})", "shift_left": "left({}, {})", "shift_right": "right({}, {})", "bits": "bits_of({})",
     },
     "b": {
         "and": "({} && {})", "or": "({} || {})", "xor": "({} != {})", "not": "(!{})",

@@ -16,6 +16,7 @@ import numpy as np
 from jax.extend import core, source_info_util
 
 from sidestep.bridges.export.program import KINDS, Node, NotTranslatable, Program, Stored, kind_of
+from sidestep.bridges.export.random_rules import RandomRules
 
 LONG = 24
 """Entries from which on a dimension becomes a loop."""
@@ -58,7 +59,7 @@ def _is_known(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype != object
 
 
-class _Translator:
+class _Translator(RandomRules):
     def __init__(self, program: Program):
         self.program = program
         self.where = "an unknown line"
@@ -93,7 +94,8 @@ class _Translator:
         if name != "cond" and inner is not None and name not in ("scan", "while"):
             closed = hasattr(inner, "consts")
             return self.run(inner.jaxpr if closed else inner, inner.consts if closed else (), inputs)
-        if all(_is_known(value) for value in inputs) and name != "cond":
+        # Keys are no arrays of numbers for JAX: the rules have their words.
+        if all(_is_known(value) for value in inputs) and name != "cond" and not name.startswith("random_"):
             with jax.ensure_compile_time_eval():
                 found = primitive.bind(*map(jax.numpy.asarray, inputs), **parameters)
             return [np.asarray(one) for one in (found if primitive.multiple_results else [found])]
