@@ -20,6 +20,8 @@ from sidestep.bridges.export.random_rules import RandomRules
 
 LONG = 24
 """Entries from which on a dimension becomes a loop."""
+_MOST_STEPS = 32
+"""Steps of a `fori_loop` up to which it is written out."""
 
 
 Nodes: TypeAlias = Any
@@ -620,6 +622,19 @@ class _Translator(RandomRules):
             results.append(made.reshape(variable.aval.shape))
             used += size
         return results
+
+    def _scan(self, equation: Any, *values: Any) -> list[Any]:
+        """One step after the other, written out: a loop of numbers would need all of its values in arrays."""
+        parameters = equation.params
+        fixed, length = parameters["num_consts"], parameters["length"]
+        if length > _MOST_STEPS:
+            raise NotImplementedError(f"{length} steps, one after another")
+        if len(values) > fixed + parameters["num_carry"] or len(equation.outvars) > parameters["num_carry"]:
+            raise NotImplementedError("arrays that it reads or writes step by step")
+        step, carried = parameters["jaxpr"], list(values[fixed:])
+        for _ in range(length):
+            carried = self.run(step.jaxpr, step.consts, [*values[:fixed], *carried])
+        return carried
 
     def _optimization_barrier(self, equation: Any, *values: Any) -> list[Any]:
         return list(values)
