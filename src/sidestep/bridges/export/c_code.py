@@ -65,7 +65,7 @@ _OPERATIONS = {
         "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "neg": "(-{})",
         "min": "least({}, {})", "max": "most({}, {})", "abs": "fabsf({})", "sign": "sign({})",
         "rem": "fmodf({}, {})", "pow": "powf({}, {})", "atan2": "atan2f({}, {})",
-        "bits": "real_of({})",
+        "bits": "real_of({})", "round": "rintf({})",
     }
     | {
         name: f"{name}f({{}})"

@@ -660,6 +660,11 @@ class _Translator(RandomRules):
 
         return self._each(convert, [value], equation.outvars[0].aval)
 
+    def _round(self, equation: Any, value: Any) -> Any:
+        if equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+            raise NotImplementedError("rounding away from zero")
+        return self._each(_plain("round"), [value], equation.outvars[0].aval)
+
     def _integer_pow(self, equation: Any, value: Any) -> Any:
         power = equation.params["y"]
         if power < 1:

@@ -34,7 +34,7 @@ IMPORTED = dict.fromkeys(
 is the remainder with the sign of the first."""
 _INSTRUCTIONS = {
     "f": {name: f"f32.{name}" for name in ("add", "sub", "mul", "div", "min", "max", "abs", "neg", "ceil",
-                                           "floor", "sqrt")} | {"bits": "f32.reinterpret_i32"},
+                                           "floor", "sqrt")} | {"bits": "f32.reinterpret_i32", "round": "f32.nearest"},
     "i": {name: f"i32.{name}" for name in ("add", "sub", "mul", "and", "or", "xor")}
     | {"shift_left": "i32.shl", "shift_right": "i32.shr_u", "bits": "i32.reinterpret_f32"},
     "b": {"and": "i32.and", "or": "i32.or", "xor": "i32.xor", "not": "i32.eqz"},

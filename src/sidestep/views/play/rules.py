@@ -8,6 +8,8 @@ from jaxtyping import Float
 from sidestep._arrays import AnyArray, Flag, length
 from sidestep.world import Scenario, World
 
+PATIENCE = 30.0
+"""Time (s) after which an unreached target is replaced, because a pursuer may block it."""
 TRIES = 64
 """Places drawn for a new target, of which the first that is clear is taken."""
 _EDGE = 0.4

@@ -30,22 +30,20 @@ from sidestep.views.play.messages import (
 from sidestep.views.play.program import traced
 from sidestep.views.play.programs import Programs
 from sidestep.views.play.recording import Recording
-from sidestep.views.play.rules import TRIES, is_touching
+from sidestep.views.play.rules import PATIENCE, TRIES, is_touching
 from sidestep.views.play.score import Score
 from sidestep.views.play.sliders import YOU, drifts_at, numbers_of, sliders_for, with_numbers
 from sidestep.views.play.verdict import quick_verdict, verdict
 from sidestep.world import Scenario, World
 
 _PLAN_EVERY = 5
-_PATIENCE = 30.0
-"""Time (s) after which an unreached target is replaced, because a pursuer may block it."""
 
 
 @final
 class Session:
     """A world simulated period by period, for one visitor. Not thread-safe.
 
-    The robot drives from target to target: a target that is reached, or not reached within `_PATIENCE`, is
+    The robot drives from target to target: a target that is reached, or not reached within `PATIENCE`, is
     replaced. A capture or a collision ends the episode (`outcome`); `restart` begins the next. While the
     shield's program is being compiled, `advance` does nothing.
     """
@@ -152,7 +150,7 @@ class Session:
                 "mode": mode if self.pursuer == YOU else control.BY_STRATEGY,
                 "command": self._drive.toward or self._drive.wheels or (0.0, 0.0),
                 "count": self._count % 2**20,
-                "renew": self._waited + self.period > _PATIENCE,
+                "renew": self._waited + self.period > PATIENCE,
                 "draws": self._random.uniform(-1.0, 1.0, (TRIES, 2)),
             }
         )
@@ -181,7 +179,7 @@ class Session:
         elif output["reached"] > 0.0:
             tally.reached += 1
         self._waited += self.period
-        if output["reached"] > 0.0 or self._waited > _PATIENCE:
+        if output["reached"] > 0.0 or self._waited > PATIENCE:
             self._waited = 0.0
 
     # Changes of the world by messages.
