@@ -32,13 +32,17 @@ IMPORTED = dict.fromkeys(
 ) | dict.fromkeys(("atan2", "pow", "rem"), 2)
 """Functions of single precision that a module may import from `math`, and how many numbers each takes; `rem`
 is the remainder with the sign of the first."""
+_PLAIN = {
+    "f": ("add", "sub", "mul", "div", "min", "max", "abs", "neg", "ceil", "floor", "sqrt"),
+    "i": ("add", "sub", "mul", "and", "or", "xor"),
+}
 _INSTRUCTIONS = {
-    "f": {name: f"f32.{name}" for name in ("add", "sub", "mul", "div", "min", "max", "abs", "neg", "ceil",
-                                           "floor", "sqrt")} | {"bits": "f32.reinterpret_i32", "round": "f32.nearest"},
-    "i": {name: f"i32.{name}" for name in ("add", "sub", "mul", "and", "or", "xor")}
+    "f": {name: f"f32.{name}" for name in _PLAIN["f"]}
+    | {"bits": "f32.reinterpret_i32", "round": "f32.nearest"},
+    "i": {name: f"i32.{name}" for name in _PLAIN["i"]}
     | {"shift_left": "i32.shl", "shift_right": "i32.shr_u", "bits": "i32.reinterpret_f32"},
     "b": {"and": "i32.and", "or": "i32.or", "xor": "i32.xor", "not": "i32.eqz"},
-}  # fmt: skip
+}
 _COMPARISONS = ("eq", "ne", "lt", "gt", "le", "ge")
 _LOADS = {
     "<f4": "f32.load", "<i4": "i32.load", "<u4": "i32.load", "<i2": "i32.load16_s", "<u2": "i32.load16_u",

@@ -31,13 +31,14 @@ BROWSER = Path(__file__).with_name("browser")
 _MARK = Path("static") / "page.json"
 """The file by which a folder is known as one of these."""
 _FOR_EVER = (
-    "By its clearance table alone, without the look-ahead of the installed package: about 1 of 100 test chases "
-    "ended at the obstacle."
+    "By its clearance table alone, without the look-ahead of the installed package: about 1 of 100 test "
+    "chases ended at the obstacle."
 )
 _FOR_A_WHILE = (
     "By its clearance table alone, which is for {seconds:.0f} s, without the look-ahead of the installed "
     "package: whoever keeps circling leads it into the obstacle."
 )
+_NO_TABLE = "Here joint goes by clearance tables alone, and there is none for these numbers."
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ def write_page(
     A folder that holds such a page is written over. `progress(text)` is called before the long part.
 
     **Raises** `ValueError` for an unknown shield or pursuer and for custom robots, `NotTranslatable` (a
-    `ValueError`) for a policy that cannot be translated, and `OutputError` for a folder that cannot be written
-    or holds something else, all before anything is written.
+    `ValueError`) for a policy that cannot be translated, and `OutputError` for a folder that cannot be
+    written or holds something else, all before anything is written.
     """
     folder = Path(folder)
     check_hosting(hosting)
@@ -105,6 +106,7 @@ def _about(hosting: Hosting, scenario: Scenario, engine: Engine, decision_steps:
         "strategies": list(STRATEGIES),
         "numbers": [slider.name for slider in SLIDERS],
         "tables": [{"words": _words(table, period)} for table in engine.tables],
+        "no_table": _NO_TABLE,
         "imports": list(IMPORTED),
         "areas": packed(engine.areas),
     }

@@ -70,7 +70,8 @@ class Program:
         @jax.jit
         def step(arrays: Any, numbers: Array, memory: Any) -> tuple[Array, Any]:
             changed, policy, given, world = parts(arrays, numbers, self.inputs)
-            after = one_period(changed, policy, make_shield(shield, changed), world, given, memory)
+            commanded = commands(changed, policy, world, given)
+            after = one_period(changed, make_shield(shield, changed), world, commanded, given, memory)
             return self.outputs.joined(after[0]), after[1]
 
         @jax.jit
@@ -143,26 +144,47 @@ def traced(scenario: Scenario, policy: Callable[..., Any]) -> Any:
     return eqx.filter((scenario, policy), eqx.is_array)
 
 
-def one_period(
-    scenario: Scenario,
-    policy: Callable[..., Any],
-    shield: Shield,
-    world: World,
-    given: dict[str, Any],
-    memory: Any,
-) -> tuple[dict[str, Any], Any]:
-    """One control period of the page: the arrays named by `layouts`, and the shield's next memory.
+class _Commanded(eqx.Module):
+    """Pursuers that drive as commanded, `wheels (m, 2)` in m/s."""
 
-    Beside the world that physics leaves (m, m/s, rad, s) there is what the page goes on with: `next_target`,
-    which is another one where it was reached or `renew` is set, and the obstacles as they have `turned`.
-    """
+    wheels: Array
+
+    def steer_all(self, scenario: Scenario, world: World) -> Array:
+        """The commanded wheel speeds."""
+        return self.wheels
+
+
+def commands(
+    scenario: Scenario, policy: Callable[..., Any], world: World, given: dict[str, Any]
+) -> tuple[Array, Array]:
+    """What policy and pursuers ask for: the nominal velocity (2,), which is `held` unless the policy is to be
+    asked, and wheel speeds (m, 2), m/s. `given`: inputs named by `layouts`."""
     nominal = jax.lax.cond(
         given["ask"] > 0.0, lambda: decide(scenario, policy, world), lambda: real(given["held"])
     )
     # A raw key: programs are also translated, and a typed one hides its words.
     key = jax.random.fold_in(jax.random.PRNGKey(0), given["count"].astype(jnp.int32))
     pursuers = PursuerControl(given["strategy"].astype(jnp.int32), given["mode"], given["command"], key)
-    step = control_step(scenario, shield, pursuers, world, memory, nominal, key)
+    return nominal, pursuers.steer_all(scenario, world)
+
+
+def one_period(
+    scenario: Scenario,
+    shield: Shield,
+    world: World,
+    commanded: tuple[Array, Array],
+    given: dict[str, Any],
+    memory: Any,
+) -> tuple[dict[str, Any], Any]:
+    """One control period of the page: the outputs named by `layouts`, and the shield's next memory.
+
+    Beside the world that physics leaves (m, m/s, rad, s) there is what the page goes on with: `next_target`,
+    which is another one where it was reached or `renew` is set, and the obstacles as they have `turned`.
+
+    **Arguments:** `commanded` by `commands`; `given`: `renew` and `draws`.
+    """
+    nominal, wheels = commanded
+    step = control_step(scenario, shield, _Commanded(wheels), world, memory, nominal, None)
     moved, memory, events, result, wheels = step
     rows = _rows(scenario, shield, world, memory)
     h = jax.vmap(lambda pose: _level(scenario, world, pose))(world.pursuers)

@@ -177,6 +177,7 @@ export class Session {
     for (let k = 0; k < draws.length; k++) draws[k] = random(-1, 1);
     if (this.fresh) engine.run(`begin ${program}`);
     this.fresh = false;
+    engine.run("ask");
     engine.run(`step ${program}`);
     this.known = true;
     this.count += 1;
@@ -217,7 +218,8 @@ export class Session {
     for (const name of ["evader", "pursuers", "obstacles", "target"]) frame[name] = rounded(parts[name]);
     this.cut = false;
     if (!this.known) return frame;
-    for (const name of ["action", "nominal", "wheels", "h", "barriers", "intervention"]) frame[name] = rounded(engine.get(name));
+    for (const name of ["action", "wheels", "h", "barriers", "intervention"]) frame[name] = rounded(engine.get(name));
+    frame.nominal = rounded(engine.get("held"));
     frame.status = this.about.statuses[engine.get("status")];
     frame.reached = engine.get("reached") > 0;
     frame.looking = engine.get("looking") > 0;
@@ -247,7 +249,7 @@ export class Session {
       type: "setup", shield: this.shield, pursuer: this.pursuer, paused: this.paused, pace: this.pace, numbers: this.numbers,
       verdict: this.verdict, states: { none: "ready", paper: "ready", game: "ready", joint }, ready: this.ready,
       show: { rows: this.show.rows, plan: this.show.plan },
-      words: this.shield === "joint" ? about.tables[table]?.words : undefined,
+      words: this.shield === "joint" ? about.tables[table]?.words ?? about.no_table : undefined,
     };
   }
 }

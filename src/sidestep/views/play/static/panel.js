@@ -131,7 +131,8 @@ export class Panel {
   take(setup) {
     this.setup = setup;
     byId(`shield-${setup.shield}`).checked = true;
-    const chances = setup.shield === "game" || setup.shield === "joint" ? ` ${CHANCES[setup.verdict.kind]}` : "";
+    const plays = setup.ready && (setup.shield === "game" || setup.shield === "joint");
+    const chances = plays ? ` ${CHANCES[setup.verdict.kind]}` : "";
     byId("shield-words").textContent = (setup.words ?? SHIELDS[setup.shield] ?? "") + chances;
     byId("pursuer").value = setup.pursuer;
     for (const [name, value] of Object.entries(setup.numbers)) {
