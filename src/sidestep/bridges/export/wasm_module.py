@@ -44,8 +44,8 @@ _OPCODES = {
     "f32.ge": 0x60, "i32.add": 0x6A, "i32.sub": 0x6B, "i32.mul": 0x6C, "i32.div": 0x6D, "i32.rem": 0x6F,
     "i32.and": 0x71, "i32.or": 0x72, "i32.xor": 0x73, "i32.shl": 0x74, "i32.shr_u": 0x76, "f32.abs": 0x8B,
     "f32.neg": 0x8C, "f32.ceil": 0x8D, "f32.floor": 0x8E, "f32.nearest": 0x90, "f32.sqrt": 0x91,
-    "f32.add": 0x92, "f32.sub": 0x93, "f32.mul": 0x94, "f32.div": 0x95, "f32.min": 0x96, "f32.max": 0x97, "f32.convert_i32": 0xB2,
-    "i32.reinterpret_f32": 0xBC, "f32.reinterpret_i32": 0xBE,
+    "f32.add": 0x92, "f32.sub": 0x93, "f32.mul": 0x94, "f32.div": 0x95, "f32.min": 0x96, "f32.max": 0x97,
+    "f32.convert_i32": 0xB2, "i32.reinterpret_f32": 0xBC, "f32.reinterpret_i32": 0xBE,
 }  # fmt: skip
 """Codes of instructions; comparisons, divisions and conversions of whole numbers are the signed ones."""
 
