@@ -171,7 +171,8 @@ class _Translator(RandomRules):
 
     def op(self, operation: str, *inputs: Node) -> Node:
         """The node of an elementwise operation; computed now where everything is known."""
-        kind = "b" if operation in _FLAGS else inputs[operation == "select"].kind
+        flag = operation in _FLAGS and (operation, inputs[0].kind) != ("not", "i")
+        kind = "b" if flag else inputs[operation == "select"].kind
         if all(node.constant for node in inputs) and operation in _NOW:
             with np.errstate(all="ignore"):
                 return self.program.constant(KINDS[kind](_NOW[operation](*(node.about for node in inputs))))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 TYPES = {"f": 0x7D, "i": 0x7F, "b": 0x7F}
 """The types f32 and i32 of each kind of number."""
@@ -60,7 +61,7 @@ def ins(name: str, *immediates: int) -> bytes:
     return code + b"".join(map(signed if name == "i32.const" else unsigned, immediates))
 
 
-def constant(kind: str, value: float | int | bool) -> bytes:
+def constant(kind: str, value: Any) -> bytes:
     """The instruction that leaves a number of a kind of `TYPES`."""
     if kind == "f":
         return ins("f32.const") + struct.pack("<f", value)
