@@ -5,6 +5,7 @@ See chapter 5 of the core specification, 2.0, <https://www.w3.org/TR/wasm-core-2
 
 from __future__ import annotations
 
+import functools
 import struct
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -51,6 +52,7 @@ _OPCODES = {
 """Codes of instructions; comparisons, divisions and conversions of whole numbers are the signed ones."""
 
 
+@functools.cache
 def ins(name: str, *immediates: int) -> bytes:
     """An instruction and what belongs to it. Blocks (`if`, `loop`) take and leave nothing."""
     if name == "i32.trunc_sat_f32":

@@ -16,12 +16,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from sidestep._arrays import real
@@ -49,25 +47,6 @@ class Traced(NamedTuple):
     outputs: list[str]
 
 
-@dataclass(frozen=True)
-class Engine:
-    """A WebAssembly module, the areas of its memory by name, the clearance tables in it, and its functions as
-    they were before."""
-
-    binary: bytes
-    areas: dict[str, Area]
-    tables: list[ClearanceTable]
-    functions: dict[str, Traced]
-
-
-def make_engine(scenario: Scenario, policy: Callable[..., Any]) -> Engine:
-    """Translate the page of a scenario; `policy` from `as_policy`. Its sliders' numbers stay inputs.
-
-    **Raises** `NotTranslatable` where the policy uses what cannot be translated.
-    """
-    return _Build(scenario, policy).engine()
-
-
 def tables_for(scenario: Scenario) -> list[ClearanceTable]:
     """The shipped clearance tables that serve a scenario with some numbers of its sliders, the one to be
     preferred first. A table is for one pursuer and one obstacle."""
@@ -82,73 +61,77 @@ def _of(table: ClearanceTable) -> dict[str, float]:
     return {slider.name: getattr(table.game, names.get(slider.name, slider.name)) for slider in SLIDERS}
 
 
-class _Build:
-    """One engine under construction."""
+@final
+class Engine:
+    """The functions of the page of a scenario: as JAX has them, and as a module. Sliders' numbers are inputs.
+
+    **Arguments:** `scenario` with the counts and modes, `policy` from `as_policy`.
+
+    **Attributes:** `areas` of the module's memory and `functions` by name, the clearance `tables` in it.
+    """
 
     def __init__(self, scenario: Scenario, policy: Callable[..., Any]):
         self.scenario, self.policy = scenario, policy
-        self.names = [slider.name for slider in SLIDERS]
-        self.place, self.inputs, self.outputs = layouts(scenario)
-        self.library = WasmLibrary()
+        self.tables = tables_for(scenario)
         self.areas: dict[str, Area] = {}
         self.functions: dict[str, Traced] = {}
-        for name, shape in {"numbers": (len(SLIDERS),), **self.inputs.shapes, **self.outputs.shapes}.items():
+        self._library = WasmLibrary()
+        self._names = [slider.name for slider in SLIDERS]
+        self._place, self._inputs, self._outputs = layouts(scenario)
+        shapes = {"numbers": (len(SLIDERS),), **self._inputs.shapes, **self._outputs.shapes}
+        shapes |= {"largest": (), "drifting": self._place.shapes["obstacles"]}
+        for name, shape in shapes.items():
             self._area(name, "f", shape)
-        self.example = np.zeros(len(SLIDERS), np.float32)
-        self.start = self._world(jnp.zeros(self.place.shapes[name]) for name in self.place.shapes)
-
-    def engine(self) -> Engine:
-        """The engine with every function."""
-        tables = tables_for(self.scenario)
-        world = list(self.place.shapes)
         self._area("words", "i", (2,))
-        self._area("accepted", "b", ())
-        self._add("draw", self._draw, ["numbers", "words"], [*world, "accepted"])
-        self._area("touching", "b", ())
-        self._area("largest", "f", ())
-        self._area("drifting", "f", self.place.shapes["obstacles"])
-        self._area("serve", "b", (len(tables),))
+        for name, shape in {"accepted": (), "touching": (), "serve": (len(self.tables),)}.items():
+            self._area(name, "b", shape)
+        world = list(self._place.shapes)
+        self.functions["draw"] = Traced(self._draw, ["numbers", "words"], [*world, "accepted"])
         looked = ["touching", "largest", "drifting", "serve"]
-        self._add("look", lambda *given: self._look(tables, *given), ["numbers", *world], looked)
+        self.functions["look"] = Traced(self._look, ["numbers", *world], looked)
         asked = [*world, "held", "ask", "strategy", "mode", "command", "count"]
-        self._add("ask", lambda *given: self._ask(asked, *given), ["numbers", *asked], ["held", "wheels"])
+        self.functions["ask"] = Traced(self._ask, ["numbers", *asked], ["held", "wheels"])
         for name in SHIELDS:
             if name != "joint":
                 self._add_shield(name, lambda changed, name=name: make_shield(name, changed))
-        for number, table in enumerate(tables):
+        for number, table in enumerate(self.tables):
             self._add_shield(f"joint {number}", lambda changed, table=table: TableShield(changed, table))
-        return Engine(self.library.binary(), self.areas, tables, self.functions)
+
+    def binary(self) -> bytes:
+        """The module with every function, translated.
+
+        **Raises** `NotTranslatable` where the policy uses what cannot be translated.
+        """
+        for name, (function, inputs, outputs) in self.functions.items():
+            areas = [[self.areas[one] for one in group] for group in (inputs, outputs)]
+            self._library.add(name, function, *areas)
+        return self._library.binary()
 
     def _area(self, name: str, kind: str, shape: tuple[int, ...]) -> None:
         if name not in self.areas:
-            self.areas[name] = self.library.area(kind, shape)
-
-    def _add(self, name: str, function: Callable[..., Any], inputs: list[str], outputs: list[str]) -> None:
-        self.functions[name] = Traced(function, inputs, outputs)
-        areas = [[self.areas[one] for one in group] for group in (inputs, outputs)]
-        self.library.add(name, function, *areas)
+            self.areas[name] = self._library.area(kind, shape)
 
     def _world(self, parts: Any) -> World:
-        return World(**dict(zip(self.place.shapes, map(real, parts), strict=True)))
+        return World(**dict(zip(self._place.shapes, map(real, parts), strict=True)))
 
     def _with(self, numbers: Array) -> Scenario:
-        return with_numbers(self.scenario, dict(zip(self.names, numbers, strict=True)))
+        return with_numbers(self.scenario, dict(zip(self._names, numbers, strict=True)))
 
     # The functions as JAX has them
 
     def _draw(self, numbers: Array, words: Array) -> tuple[Any, ...]:
         world, accepted = self._with(numbers).draw(words.astype(jnp.uint32))
-        return (*(getattr(world, name) for name in self.place.shapes), accepted)
+        return (*(getattr(world, name) for name in self._place.shapes), accepted)
 
-    def _ask(self, names: list[str], numbers: Array, *values: Array) -> tuple[Any, ...]:
-        given = dict(zip(names, values, strict=True))
-        world = self._world(given[name] for name in self.place.shapes)
-        return commands(self._with(numbers), self.policy, world, given)
+    def _ask(self, *values: Array) -> tuple[Any, ...]:
+        given = dict(zip(self.functions["ask"].inputs, values, strict=True))
+        world = self._world(given[name] for name in self._place.shapes)
+        return commands(self._with(given["numbers"]), self.policy, world, given)
 
-    def _look(self, tables: list[ClearanceTable], numbers: Array, *place: Array) -> tuple[Any, ...]:
+    def _look(self, numbers: Array, *place: Array) -> tuple[Any, ...]:
         changed, world = self._with(numbers), self._world(place)
-        drifts = drifts_at(world.obstacles[:, 2:], numbers[self.names.index("obstacle_speed")])
-        serve = [table.game.serves(changed) for table in tables]
+        drifts = drifts_at(world.obstacles[:, 2:], numbers[self._names.index("obstacle_speed")])
+        serve = [table.game.serves(changed) for table in self.tables]
         return (
             is_touching(changed, world),
             CaptureGame.of(changed).largest_capture_distance,
@@ -157,32 +140,34 @@ class _Build:
         )
 
     def _add_shield(self, name: str, made: Callable[[Scenario], Shield]) -> None:
-        # With traced numbers: those of the scenario itself may not be what a shield is made for.
-        begun = jax.eval_shape(lambda numbers: made(self._with(numbers)).init(self.start), self.example)
-        memory, structure = jax.tree.flatten_with_path(begun)
-        kept = []
-        for keys, leaf in memory:
-            kept.append(f"{name}{re.sub(r'[^a-z_0-9]+', ' ', jax.tree_util.keystr(keys))}".strip())
-            self._area(kept[-1], kind_of(leaf.dtype), leaf.shape)
+        world, unread = list(self._place.shapes), ("nominal", *_NEXT.values())
+        reads = [*world, "renew", "draws", "held", "wheels"]
+        writes = [part for part in self._outputs.shapes if part not in unread]
 
-        def begin(numbers: Array, *place: Array) -> tuple[Any, ...]:
-            return tuple(jax.tree.leaves(made(self._with(numbers)).init(self._world(place))))
+        def start(numbers: Array, *place: Array) -> Any:
+            return made(self._with(numbers)).init(self._world(place))
 
-        reads = [*self.place.shapes, "renew", "draws", "held", "wheels"]
+        def begin(*given: Array) -> tuple[Any, ...]:
+            return tuple(jax.tree.leaves(start(*given)))
 
         def step(numbers: Array, *values: Array) -> tuple[Any, ...]:
             changed, given = self._with(numbers), dict(zip(reads, values[: len(reads)], strict=True))
-            world = self._world(given[name] for name in self.place.shapes)
             before = jax.tree.unflatten(structure, values[len(reads) :])
             commanded = (given["held"], given["wheels"])
-            found, after = one_period(changed, made(changed), world, commanded, given, before)
-            parts = [found[_NEXT.get(name, name)] for name in writes]
+            now = self._world(given[part] for part in world)
+            found, after = one_period(changed, made(changed), now, commanded, given, before)
+            parts = [found[_NEXT.get(part, part)] for part in writes]
             return (*map(real, parts), *jax.tree.leaves(after))
 
-        unread = ("nominal", *_NEXT.values())
-        writes = [name for name in self.outputs.shapes if name not in unread]
-        self._add(f"begin {name}", begin, ["numbers", *self.place.shapes], kept)
-        self._add(f"step {name}", step, ["numbers", *reads, *kept], [*writes, *kept])
+        shapes = [jax.ShapeDtypeStruct(self.areas[part].shape, jnp.float32) for part in ("numbers", *world)]
+        memory, structure = jax.tree.flatten_with_path(jax.eval_shape(start, *shapes))
+        kept = []
+        for keys, leaf in memory:
+            words = re.sub(r"[^a-z_0-9]+", " ", jax.tree_util.keystr(keys))
+            kept.append(f"{name} {words.strip() or 'memory'}")
+            self._area(kept[-1], kind_of(leaf.dtype), leaf.shape)
+        self.functions[f"begin {name}"] = Traced(begin, ["numbers", *world], kept)
+        self.functions[f"step {name}"] = Traced(step, ["numbers", *reads, *kept], [*writes, *kept])
 
 
 def packed(areas: dict[str, Area]) -> dict[str, list[Any]]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import sidestep
 from sidestep.bridges.export.wasm_code import IMPORTED
-from sidestep.bridges.static_page.engine import Engine, make_engine, packed
+from sidestep.bridges.static_page.engine import Engine, packed
 from sidestep.loop.policies import as_policy
 from sidestep.loop.step import decision_steps_of
 from sidestep.safety.certificate.situation import plain
@@ -81,13 +81,13 @@ def _files(hosting: Hosting) -> dict[str, bytes]:
     """Contents by name, the page itself last."""
     scenario = endless(hosting.scenario)
     policy = as_policy(hosting.policy, scenario)
-    engine = make_engine(scenario, policy)
+    engine = Engine(scenario, policy)
     files = {f"static/{path.name}": path.read_bytes() for path in sorted(STATIC.iterdir())}
     page = files.pop("static/index.html")
     files |= {f"static/{path.name}": path.read_bytes() for path in sorted(BROWSER.iterdir())}
     about = _about(hosting, scenario, engine, decision_steps_of(policy))
     files["static/page.json"] = json.dumps(about, indent=1, allow_nan=False).encode()
-    files["static/engine.bin"] = gzip.compress(engine.binary, 9, mtime=0)
+    files["static/engine.bin"] = gzip.compress(engine.binary(), 9, mtime=0)
     return files | {"index.html": page}
 
 

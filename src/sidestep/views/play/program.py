@@ -153,6 +153,10 @@ class _Commanded(eqx.Module):
         """The commanded wheel speeds."""
         return self.wheels
 
+    def __call__(self, scenario: Scenario, world: World, key: Any) -> Array:
+        """Those of the first pursuer alone."""
+        return self.wheels[0]
+
 
 def commands(
     scenario: Scenario, policy: Callable[..., Any], world: World, given: dict[str, Any]

@@ -1,6 +1,6 @@
 // The translated program: typed views of its memory by name, and its functions. It needs nothing but Math.
 
-function singles(names) {
+export function singles(names) {
   const { fround } = Math;
   const made = Object.fromEntries(names.map((name) => [name, (a, b) => fround(Math[name](a, b))]));
   made.rem = (a, b) => fround(a % b);
