@@ -30,7 +30,7 @@ BESIDE = "#shield={shield}&pursuer=nash&evader=0,0&target=0,1.4&p=-0.35,0,0&o=1.
 AHEAD = "#shield=none&pursuer=you&evader=0,0&target=1.4,0&p=-0.22,0,0&o=0,-1.2,0,0"
 """A link: the robot close before the pursuer of whoever is at the page, which is faster."""
 PLACE = {
-    "evader": [[0.0, 0.0]], "target": [[1.2, 0.9]], "pursuers": [[-0.3, 0.1, 0.3]],
+    "evader": [[0.0, 0.0]], "target": [[1.2, 0.9]], "pursuers": [[-0.23, 0.0, 0.0]],
     "obstacles": [[0.5, -0.9, 0.02, 0.01]],
 }  # fmt: skip
 
@@ -225,7 +225,6 @@ def test_its_session_goes_as_that_of_the_live_page(folder, scenario, node, tmp_p
     from sidestep.views.play.programs import Programs
     from sidestep.views.play.session import Session
 
-    scenario = endless(scenario)
     programs = Programs(scenario, as_policy(load_policy("pretrained"), scenario))
     session = Session(programs, "none", "nash", Limits(), 0)
     while not session.ready:
@@ -297,7 +296,7 @@ CHOSEN = ("renew", "ask", "strategy", "mode", "count", "words", "draws")
 
 @pytest.fixture(scope="module")
 def scenario():
-    return load_scenario("paper", observation="motion")
+    return endless(load_scenario("paper", observation="motion"))
 
 
 @pytest.fixture(scope="module")
