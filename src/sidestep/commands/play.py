@@ -117,8 +117,8 @@ def _write(folder: Path, hosting: Any, console: Console) -> int:
 
     written = write_page(folder, hosting, progress=lambda text: say(console, text))
     say(console, f"{written.folder}: {written.size / 1e6:.2f} MB, for any static web host")
-    if not written.tables:
-        say(console, "No clearance table serves this scenario: the page offers game in place of joint.")
+    if written.shield != hosting.shield:
+        say(console, "No clearance table serves this scenario: the page begins with game in place of joint.")
     say(console, f"Look at it: python -m http.server --directory {shlex.quote(str(written.folder))} 8000")
     return 0
 

@@ -106,22 +106,17 @@ class RandomRules:
         return made
 
     def _bitcast_convert_type(self, equation: Any, value: Any) -> Any:
-        old, new = value_dtype(value), np.dtype(equation.params["new_dtype"])
-        if new.itemsize != 4 or equation.outvars[0].aval.shape != value.shape:
-            raise NotImplementedError(f"bits of another width, {new}")
-        kind = "f" if new.kind == "f" else "i"
-        made = np.empty(value.shape, object)
-        words = self.nodes(value)
-        for place in np.ndindex(*value.shape):
-            same = old == kind
-            made[place] = words[place] if same else self.program.make("bits", words[place], kind=kind)
+        new = np.dtype(equation.params["new_dtype"])
+        old = np.dtype(equation.invars[0].aval.dtype)
+        if (old.itemsize, new.itemsize) != (4, 4):
+            raise NotImplementedError(f"the bits of {old} as {new}")
+        words, kind = self.nodes(value), "f" if new.kind == "f" else "i"
+        made = np.empty(words.shape, object)
+        for place in np.ndindex(*words.shape):
+            word = words[place]
+            made[place] = word if word.kind == kind else self.program.make("bits", word, kind=kind)
         return made
 
     def _split(self, equation: Any, value: Any) -> list[Any]:
         ends = np.cumsum([int(size) for size in equation.params["sizes"]])[:-1]
         return list(np.split(self.nodes(value), ends, int(equation.params["axis"])))
-
-
-def value_dtype(value: Any) -> str:
-    """The kind of number of an array of nodes."""
-    return value.reshape(-1)[0].kind

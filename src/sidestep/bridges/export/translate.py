@@ -310,8 +310,11 @@ class _Translator(RandomRules):
         return Looped(value.nodes.reshape(shape[:axis] + shape[axis + 1 :]), axis, value.size)
 
     def _joined(self, values: Sequence[Any], along: int) -> Any:
-        values = [value for value in values if 0 not in value.shape] or values[:1]
-        total = sum(value.shape[along] for value in values)
+        total, shape = sum(value.shape[along] for value in values), list(values[0].shape)
+        values = [value for value in values if 0 not in value.shape]
+        if not values:
+            shape[along] = total
+            return np.empty(shape, object)
         looped = [value for value in values if isinstance(value, Looped)]
         axis = looped[0].axis if looped else (along if total >= LONG else None)
         if axis is None:
@@ -365,7 +368,8 @@ class _Translator(RandomRules):
         nodes = value.nodes if isinstance(value, Looped) else self.nodes(value)
         inner = tuple(sorted(d - (d > loop) for d in axes if d != loop))
         rest = [k for k in range(nodes.ndim) if k not in inner]
-        moved = np.transpose(nodes, (*rest, *inner)).reshape(*(nodes.shape[k] for k in rest), -1)
+        count = math.prod(nodes.shape[k] for k in inner)
+        moved = np.transpose(nodes, (*rest, *inner)).reshape(*(nodes.shape[k] for k in rest), count)
         made = np.empty(moved.shape[:-1], object)
         for place in np.ndindex(made.shape):
             entries = list(moved[place])

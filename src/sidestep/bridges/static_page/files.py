@@ -43,11 +43,12 @@ _NO_TABLE = "Here joint goes by clearance tables alone, and there is none for th
 
 @dataclass(frozen=True)
 class Written:
-    """What was written: the folder, the size of all files (bytes), and how many clearance tables serve."""
+    """What was written: the folder, the size of all files (bytes), and the shield that the page begins with:
+    `game` in place of `joint` where no clearance table serves the scenario."""
 
     folder: Path
     size: int
-    tables: int
+    shield: str
 
 
 def write_page(
@@ -73,8 +74,8 @@ def write_page(
     make_folder(folder / "static")
     for name, content in files.items():
         write_bytes(folder / name, content)
-    tables = len(json.loads(files["static/page.json"])["tables"])
-    return Written(folder, sum(map(len, files.values())), tables)
+    shield = json.loads(files["static/page.json"])["shield"]
+    return Written(folder, sum(map(len, files.values())), shield)
 
 
 def _files(hosting: Hosting) -> dict[str, bytes]:
@@ -94,10 +95,11 @@ def _files(hosting: Hosting) -> dict[str, bytes]:
 def _about(hosting: Hosting, scenario: Scenario, engine: Engine, decision_steps: int) -> dict[str, Any]:
     """What the browser has to know."""
     numbers, period = numbers_of(scenario), plain(scenario.control_period)
+    serves = any(not table.game.refuses(scenario) for table in engine.tables)
     return {
         "sidestep": sidestep.__version__,
         "hello": greeting(scenario, hosting.policy, formats=[]),
-        "shield": hosting.shield,
+        "shield": "game" if hosting.shield == "joint" and not serves else hosting.shield,
         "pursuer": hosting.pursuer,
         "decision_steps": decision_steps,
         "patience": PATIENCE,
