@@ -66,7 +66,7 @@ class RandomRules:
         counts = [np.broadcast_to(self.nodes(value), shape) for value in counts]
         made = [np.empty(shape, object), np.empty(shape, object)]
         for place in np.ndindex(*shape):
-            schedule = [keys[0][place], keys[1][place]]
+            schedule: list[Any] = [keys[0][place], keys[1][place]]
             parity = self.op("xor", self.program.constant(_PARITY), self.op("xor", *schedule))
             schedule.append(parity)
             one, other = (self.op("add", counts[k][place], schedule[k]) for k in (0, 1))
@@ -96,13 +96,13 @@ class RandomRules:
         if aval.dtype.itemsize != 4:
             raise NotImplementedError(f"shifts of {aval.dtype}")
         made = np.empty(aval.shape, object)
-        words, bits = (np.broadcast_to(self.nodes(part), aval.shape) for part in (value, by))
+        words, shifts = (np.broadcast_to(self.nodes(part), aval.shape) for part in (value, by))
         for place in np.ndindex(*aval.shape):
-            if not bits[place].constant:
+            bits: Any = shifts[place]
+            if not bits.constant:
                 raise NotImplementedError("a shift by a number that is not known")
-            inside = 0 <= int(bits[place].about) < 32
             zero = self.program.constant(np.int32(0))
-            made[place] = self.op(operation, words[place], bits[place]) if inside else zero
+            made[place] = self.op(operation, words[place], bits) if 0 <= int(bits.about) < 32 else zero
         return made
 
     def _bitcast_convert_type(self, equation: Any, value: Any) -> Any:
