@@ -27,8 +27,8 @@ from sidestep.world import load_scenario
 WAIT = 60_000
 BESIDE = "#shield={shield}&pursuer=nash&evader=0,0&target=0,1.4&p=-0.35,0,0&o=1.2,-1.2,0,0"
 """A link: the robot right before the pursuer, which must give way at once or be caught."""
-AHEAD = "#shield=none&pursuer=you&evader=0,0&target=1.4,0&p=-0.22,0,0&o=0,-1.2,0,0"
-"""A link: the robot close before the pursuer of whoever is at the page, which is faster."""
+AHEAD = "#shield=none&pursuer=you&evader_speed=0.05&evader=0,0&target=1.4,0&p=-0.35,0,0&o=0,-1.2,0,0"
+"""A link: a slow robot before the pursuer of whoever is at the page."""
 PLACE = {
     "evader": [[0.0, 0.0]], "target": [[1.2, 0.9]], "pursuers": [[-0.23, 0.0, 0.0]],
     "obstacles": [[0.5, -0.9, 0.02, 0.01]],
