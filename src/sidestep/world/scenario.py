@@ -142,6 +142,11 @@ class Scenario(eqx.Module):
             evader_state=None if model is None else model.start(self, jax.random.fold_in(key, 6)),
         )
 
+    def draw(self, key: PRNGKeyArray) -> tuple[World, Flag]:
+        """One try of `reset`: a random world, and whether an episode may start in it."""
+        world = self._draw(key)
+        return world, self.accepts(world)
+
     def accepts(self, world: World) -> Flag:
         """Whether an episode may start in a world: no immediate capture, nothing inside an obstacle.
 

@@ -5,5 +5,6 @@ from sidestep.bridges.export.files import ALONE, WHAT
 from sidestep.bridges.export.jax_export import export_jax
 from sidestep.bridges.export.onnx_export import export_onnx
 from sidestep.bridges.export.program import NotTranslatable
+from sidestep.bridges.export.wasm_code import WasmLibrary
 
-__all__ = ["ALONE", "WHAT", "NotTranslatable", "export_c", "export_jax", "export_onnx"]
+__all__ = ["ALONE", "WHAT", "NotTranslatable", "WasmLibrary", "export_c", "export_jax", "export_onnx"]

@@ -39,6 +39,18 @@ static inline int32_t quotient(int32_t a, int32_t b)
 {
     return b == 0 ? -1 : b == -1 ? minus(0, a) : a / b;
 }
+static inline int32_t left(int32_t a, int32_t b) { return (int32_t)((uint32_t)a << b); }
+static inline int32_t right(int32_t a, int32_t b) { return (int32_t)((uint32_t)a >> b); }
+static inline float real_of(int32_t a)
+{
+    const union { int32_t whole; float real; } bits = {a};
+    return bits.real;
+}
+static inline int32_t bits_of(float a)
+{
+    const union { float real; int32_t whole; } bits = {a};
+    return bits.whole;
+}
 static inline int32_t sign_i(int32_t a) { return (a > 0) - (a < 0); }
 static inline float sign(float a) { return a > 0.0f ? 1.0f : a < 0.0f ? -1.0f : a; }
 static inline int32_t whole(float a)
@@ -53,6 +65,7 @@ _OPERATIONS = {
         "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "neg": "(-{})",
         "min": "least({}, {})", "max": "most({}, {})", "abs": "fabsf({})", "sign": "sign({})",
         "rem": "fmodf({}, {})", "pow": "powf({}, {})", "atan2": "atan2f({}, {})",
+        "bits": "real_of({})", "round": "rintf({})",
     }
     | {
         name: f"{name}f({{}})"
@@ -65,7 +78,8 @@ _OPERATIONS = {
         "add": "plus({}, {})", "sub": "minus({}, {})", "mul": "times({}, {})", "min": "least_i({}, {})",
         "max": "most_i({}, {})", "rem": "rest({}, {})", "div": "quotient({}, {})", "abs": "size({})",
         "neg": "minus(0, {})", "sign": "sign_i({})", "not": "(~{})", "and": "({} & {})", "or": "({} | {})",
-        "xor": "({} ^ {})",
+        "xor": "({} ^ {})", "shift_left": "left({}, {})", "shift_right": "right({}, {})",
+        "bits": "bits_of({})",
     },
     "b": {
         "and": "({} && {})", "or": "({} || {})", "xor": "({} != {})", "not": "(!{})",
@@ -108,14 +122,12 @@ def table(name: str, values: np.ndarray) -> list[str]:
 
 
 @no_type_check  # called millions of times: checking types would take the tests a minute
-class CBody:
-    """The statements of a function that leaves the `outputs`, (where, node), of a program."""
+class Body:
+    """What the `outputs`, (where, node), of a program need, and who uses it: the same for every back end."""
 
     def __init__(self, program: Program, outputs: list[tuple[str, Node]]):
         self.program, self.outputs = program, outputs
         self.live = live(program, [node for _, node in outputs])
-        self.names: dict[Any, str] = {}
-        self.short: dict[Node, bool] = {}
         self.arrays: dict[Block, list[Stored]] = defaultdict(list)
         self.parts: dict[Loop, list[tuple[Stored, int, Node]]] = defaultdict(list)
         self.users: dict[Node, list[Any]] = defaultdict(list)
@@ -149,6 +161,30 @@ class CBody:
     def _live_nodes(self, operation: str) -> list[Node]:
         return [one for one in self.live if isinstance(one, Node) and one.operation == operation]
 
+    def _reductions(self, block: Block) -> dict[Loop, list[Node]]:
+        """The reductions of a block by the loop that they are over."""
+        found: dict[Loop, list[Node]] = defaultdict(list)
+        for node in block.nodes:
+            if node.operation == "reduce" and node in self.live:
+                assert node.inputs[0].loop is not None
+                found[node.inputs[0].loop].append(node)
+        return found
+
+    def _has_one_user(self, node: Node) -> bool:
+        """Whether it may be computed where it is used: once, and as often as it would be by itself."""
+        users = self.users[node]
+        return len(users) == 1 and users[0] is (node.loop or node.block)
+
+
+@no_type_check  # as above
+class CBody(Body):
+    """The statements of a function that leaves the `outputs`, (where, node), of a program."""
+
+    def __init__(self, program: Program, outputs: list[tuple[str, Node]]):
+        super().__init__(program, outputs)
+        self.names: dict[Any, str] = {}
+        self.short: dict[Node, bool] = {}
+
     def lines(self) -> list[str]:
         """The body of the function."""
         lines = self._block(self.program.root)
@@ -164,11 +200,7 @@ class CBody:
         lines = []
         for array in sorted(self.arrays[block], key=lambda array: (array.stage, array.size)):
             lines.append(f"{TYPES[array.kind]} {self._name(array, 'a')}[{array.size}];")
-        reductions: dict[Loop, list[Node]] = defaultdict(list)
-        for node in block.nodes:
-            if node.operation == "reduce" and node in self.live:
-                assert node.inputs[0].loop is not None
-                reductions[node.inputs[0].loop].append(node)
+        reductions = self._reductions(block)
         for stage in range(block.stages):
             for (at, _), loop in block.loops.items():
                 if at == stage:
@@ -252,8 +284,7 @@ class CBody:
             return False
         if node.operation in ("constant", "given", "counter"):
             return True
-        users = self.users[node]
-        if len(users) != 1 or users[0] is not (node.loop or node.block):
+        if not self._has_one_user(node):
             return False
         if node not in self.short:
             self.short[node] = len(self._expression(node)) <= _INLINE

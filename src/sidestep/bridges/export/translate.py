@@ -16,9 +16,12 @@ import numpy as np
 from jax.extend import core, source_info_util
 
 from sidestep.bridges.export.program import KINDS, Node, NotTranslatable, Program, Stored, kind_of
+from sidestep.bridges.export.random_rules import RandomRules
 
 LONG = 24
 """Entries from which on a dimension becomes a loop."""
+_MOST_STEPS = 32
+"""Steps of a `fori_loop` up to which it is written out."""
 
 
 Nodes: TypeAlias = Any
@@ -59,7 +62,7 @@ def _is_known(value: Any) -> bool:
 
 
 @no_type_check  # called millions of times: checking types would take the tests a minute
-class _Translator:
+class _Translator(RandomRules):
     def __init__(self, program: Program):
         self.program = program
         self.where = "an unknown line"
@@ -94,7 +97,8 @@ class _Translator:
         if name != "cond" and inner is not None and name not in ("scan", "while"):
             closed = hasattr(inner, "consts")
             return self.run(inner.jaxpr if closed else inner, inner.consts if closed else (), inputs)
-        if all(_is_known(value) for value in inputs) and name != "cond":
+        # Keys are no arrays of numbers for JAX: the rules have their words.
+        if all(_is_known(value) for value in inputs) and name != "cond" and not name.startswith("random_"):
             with jax.ensure_compile_time_eval():
                 found = primitive.bind(*map(jax.numpy.asarray, inputs), **parameters)
             return [np.asarray(one) for one in (found if primitive.multiple_results else [found])]
@@ -168,7 +172,8 @@ class _Translator:
 
     def op(self, operation: str, *inputs: Node) -> Node:
         """The node of an elementwise operation; computed now where everything is known."""
-        kind = "b" if operation in _FLAGS else inputs[operation == "select"].kind
+        flag = operation in _FLAGS and (operation, inputs[0].kind) != ("not", "i")
+        kind = "b" if flag else inputs[operation == "select"].kind
         if all(node.constant for node in inputs) and operation in _NOW:
             with np.errstate(all="ignore"):
                 return self.program.constant(KINDS[kind](_NOW[operation](*(node.about for node in inputs))))
@@ -306,8 +311,11 @@ class _Translator:
         return Looped(value.nodes.reshape(shape[:axis] + shape[axis + 1 :]), axis, value.size)
 
     def _joined(self, values: Sequence[Any], along: int) -> Any:
-        values = [value for value in values if 0 not in value.shape] or values[:1]
-        total = sum(value.shape[along] for value in values)
+        total, shape = sum(value.shape[along] for value in values), list(values[0].shape)
+        values = [value for value in values if 0 not in value.shape]
+        if not values:
+            shape[along] = total
+            return np.empty(shape, object)
         looped = [value for value in values if isinstance(value, Looped)]
         axis = looped[0].axis if looped else (along if total >= LONG else None)
         if axis is None:
@@ -361,7 +369,8 @@ class _Translator:
         nodes = value.nodes if isinstance(value, Looped) else self.nodes(value)
         inner = tuple(sorted(d - (d > loop) for d in axes if d != loop))
         rest = [k for k in range(nodes.ndim) if k not in inner]
-        moved = np.transpose(nodes, (*rest, *inner)).reshape(*(nodes.shape[k] for k in rest), -1)
+        count = math.prod(nodes.shape[k] for k in inner)
+        moved = np.transpose(nodes, (*rest, *inner)).reshape(*(nodes.shape[k] for k in rest), count)
         made = np.empty(moved.shape[:-1], object)
         for place in np.ndindex(made.shape):
             entries = list(moved[place])
@@ -620,6 +629,19 @@ class _Translator:
             used += size
         return results
 
+    def _scan(self, equation: Any, *values: Any) -> list[Any]:
+        """One step after the other, written out: a loop of numbers would need all of its values in arrays."""
+        parameters = equation.params
+        fixed, length = parameters["num_consts"], parameters["length"]
+        if length > _MOST_STEPS:
+            raise NotImplementedError(f"{length} steps, one after another")
+        if len(values) > fixed + parameters["num_carry"] or len(equation.outvars) > parameters["num_carry"]:
+            raise NotImplementedError("arrays that it reads or writes step by step")
+        step, carried = parameters["jaxpr"], list(values[fixed:])
+        for _ in range(length):
+            carried = self.run(step.jaxpr, step.consts, [*values[:fixed], *carried])
+        return carried
+
     def _optimization_barrier(self, equation: Any, *values: Any) -> list[Any]:
         return list(values)
 
@@ -643,6 +665,11 @@ class _Translator:
             return me.program.make(f"to_{kind}", node, kind=kind)
 
         return self._each(convert, [value], equation.outvars[0].aval)
+
+    def _round(self, equation: Any, value: Any) -> Any:
+        if equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+            raise NotImplementedError("rounding away from zero")
+        return self._each(_plain("round"), [value], equation.outvars[0].aval)
 
     def _integer_pow(self, equation: Any, value: Any) -> Any:
         power = equation.params["y"]

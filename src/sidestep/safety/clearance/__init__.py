@@ -9,6 +9,7 @@ from sidestep.safety.clearance.table import (
     checked,
     clearance_table,
     shipped_table,
+    shipped_tables,
     table_for,
 )
 
@@ -23,6 +24,7 @@ __all__ = [
     "checked",
     "clearance_table",
     "shipped_table",
+    "shipped_tables",
     "solve",
     "table_for",
 ]

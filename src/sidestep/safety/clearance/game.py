@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._arrays import Flag
 from sidestep._bounds import within
 from sidestep.safety.sampled.sampled_design import COARSE, best_angle, largest_true
 from sidestep.safety.sampled.sampled_game import SampledGame
@@ -85,24 +88,35 @@ class ClearanceGame:
             return "it has robots of its own"
         if self.wall:
             return "its obstacles are discs, the table's is a wall"
-        drift = float(np.hypot(*np.asarray(scenario.obstacle_velocity, float)))
-        level = max(float(scenario.capture_distance) - self.shortfall, 0.0)
-        compared = (
-            ("evader_speed", float(scenario.evader_speed), -1),
-            ("pursuer_speed", float(scenario.pursuer_speed), 0),
-            ("half_axle", float(scenario.pursuer_half_axle), 0),
-            ("capture_distance", level, 1),
-            ("collision_distance", float(scenario.collision_distance), 1),
-            ("obstacle_speed", drift, 1),
-            ("control_period", float(scenario.control_period), 0),
-        )
-        for name, value, harder in compared:
+        for name, value, harder in self._compared(scenario, np):
             solved = getattr(self, name)
-            if harder * (value - solved) > 1e-6 * solved or (not harder and abs(value / solved - 1.0) > 1e-6):
-                return f"its {name} is {value:.4g}, the table's {solved:.4g}"
+            if _is_beyond(value, solved, harder):
+                return f"its {name} is {float(value):.4g}, the table's {solved:.4g}"
         if self.can_stop and scenario.action != "velocity":
             return "its evader cannot stop, the table's can"
         return ""
+
+    def serves(self, scenario: Scenario) -> Flag:
+        """Whether a table of this game serves a scenario by its numbers, which may be traced; see `refuses`
+        for the rest."""
+        compared = self._compared(scenario, jnp)
+        beyond = [_is_beyond(value, getattr(self, name), harder) for name, value, harder in compared]
+        return ~jnp.any(jnp.stack(beyond))
+
+    def _compared(self, scenario: Scenario, xp: Any) -> list[tuple[str, Any, int]]:
+        """Names, a scenario's numbers, and whether larger (1) or smaller ones (-1) are harder for the evader,
+        or any other (0)."""
+        level = xp.asarray(scenario.capture_distance) - self.shortfall
+        drift = xp.asarray(scenario.obstacle_velocity)
+        return [
+            ("evader_speed", xp.asarray(scenario.evader_speed), -1),
+            ("pursuer_speed", xp.asarray(scenario.pursuer_speed), 0),
+            ("half_axle", xp.asarray(scenario.pursuer_half_axle), 0),
+            ("capture_distance", xp.maximum(level, 0.0), 1),
+            ("collision_distance", xp.asarray(scenario.collision_distance), 1),
+            ("obstacle_speed", xp.hypot(drift[0], drift[1]), 1),
+            ("control_period", xp.asarray(scenario.control_period), 0),
+        ]
 
     @property
     def as_dict(self) -> dict[str, float]:
@@ -141,6 +155,12 @@ _NEARLY = 0.95
 """Share of the capture distance that an evader must be able to keep to keep it nearly."""
 _BELOW = 0.998
 """Share of the largest distance that it can keep: the design angle then has some slack."""
+
+
+def _is_beyond(value: Any, solved: float, harder: int) -> Any:
+    """Whether a number is harder for the evader than the one solved for, beyond rounding."""
+    off = harder * (value - solved) if harder else abs(value - solved)
+    return off > 1e-6 * solved
 
 
 def _design(scenario: Scenario, nearest: bool) -> tuple[float, float]:

@@ -168,7 +168,7 @@ class ClearanceTable(eqx.Module):
     @property
     def farthest(self) -> float:
         """The largest R, m: obstacles beyond do not matter from any z with h' >= 0."""
-        return STEP * float(jnp.max(self.clearance))
+        return STEP * float(np.max(np.asarray(self.clearance)))
 
     @property
     def smallest_gap(self) -> float:
@@ -260,8 +260,12 @@ def table_for(scenario: Scenario, *, progress: Callable[[Solution], None] | None
 def shipped_table(scenario: Scenario) -> ClearanceTable | None:
     """The table that comes with sidestep and serves a scenario (see `ClearanceGame.refuses`), if any: of
     several one for ever, and that with the least clearance."""
-    serving = [table for table in _shipped().values() if not table.game.refuses(scenario)]
-    return min(serving, key=lambda table: (table.periods is not None, table.farthest), default=None)
+    return next((table for table in shipped_tables() if not table.game.refuses(scenario)), None)
+
+
+def shipped_tables() -> list[ClearanceTable]:
+    """The tables that come with sidestep, the one to be preferred first: for ever, with little clearance."""
+    return sorted(_shipped().values(), key=lambda table: (table.periods is not None, table.farthest))
 
 
 @dataclass(frozen=True)

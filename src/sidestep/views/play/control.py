@@ -48,7 +48,8 @@ class PursuerControl(eqx.Module):
         driven = jnp.where(
             self.mode == BY_WHEELS, limit * jnp.clip(self.command, -1.0, 1.0), self._to_point(scenario, world)
         )
-        return wheels.at[0].set(jnp.where(self.mode == BY_STRATEGY, wheels[0], driven))
+        first = jnp.where(self.mode == BY_STRATEGY, wheels[0], driven)
+        return jnp.concatenate([first[None], wheels[1:]])
 
     def __call__(self, scenario: Scenario, world: World, key: PRNGKeyArray) -> Float[Array, "2"]:
         """Wheel speeds of the first pursuer alone."""

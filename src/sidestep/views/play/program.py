@@ -17,12 +17,33 @@ from sidestep.safety import BarrierRows, PursuitBarrier, Shield, make_shield
 from sidestep.safety.shields.answer import with_obstacles
 from sidestep.views.play.control import PursuerControl
 from sidestep.views.play.layout import Layout
+from sidestep.views.play.rules import TRIES, another_target, turned_back
 from sidestep.world import Scenario, World
 from sidestep.world.capture_geometry import capture_set_distance, to_pursuer_frame
 
 EVENTS = (
     "reward", "captured", "collided", "reached", "timed_out", "pursuer_clearance", "obstacle_clearance",
 )  # fmt: skip
+
+
+def layouts(scenario: Scenario) -> tuple[Layout, Layout, Layout]:
+    """The layouts of a world, of the inputs of `one_period` (a world first), and of its outputs."""
+    m, k = scenario.pursuer_count, scenario.obstacle_count
+    place: dict[str, tuple[int, ...]] = {
+        "evader": (2,), "pursuers": (m, 3), "obstacles": (k, 4), "target": (2,), "time": (),
+        "evader_velocity": (2,), "wheel_speeds": (m, 2),
+    }  # fmt: skip
+    inputs: dict[str, tuple[int, ...]] = {
+        **place, "held": (2,), "ask": (), "strategy": (), "mode": (), "command": (2,), "count": (),
+        "renew": (), "draws": (TRIES, 2),
+    }  # fmt: skip
+    outputs: dict[str, tuple[int, ...]] = {
+        **place, "nominal": (2,), "action": (2,), "wheels": (m, 2), "status": (), "barriers": (m + k,),
+        "slack": (), "intervention": (), **dict.fromkeys(EVENTS, ()),
+        "h": (m,), "normals": (m + k, 2), "offsets": (m + k,), "looking": (),
+        "next_target": (2,), "turned": (k, 4),
+    }  # fmt: skip
+    return Layout(place), Layout(inputs), Layout(outputs)
 
 
 @final
@@ -37,19 +58,8 @@ class Program:
     """
 
     def __init__(self, scenario: Scenario, shield: str, policy: Callable[..., Any]):
-        m, k = scenario.pursuer_count, scenario.obstacle_count
-        place: dict[str, tuple[int, ...]] = {
-            "evader": (2,), "pursuers": (m, 3), "obstacles": (k, 4), "target": (2,), "time": (),
-            "evader_velocity": (2,), "wheel_speeds": (m, 2),
-        }  # fmt: skip
-        self.inputs = Layout({**place, "held": (2,), "ask": (), "strategy": (), "mode": (), "command": (2,),
-                              "count": ()})  # fmt: skip
-        self.outputs = Layout({
-            **place, "nominal": (2,), "action": (2,), "wheels": (m, 2), "status": (), "barriers": (m + k,),
-            "slack": (), "intervention": (), **dict.fromkeys(EVENTS, ()),
-            "h": (m,), "normals": (m + k, 2), "offsets": (m + k,), "looking": (),
-        })  # fmt: skip
-        self.place = Layout(place)
+        self.place, self.inputs, self.outputs = layouts(scenario)
+        place = self.place.shapes
         _, fixed = eqx.partition((scenario, policy), eqx.is_array)
 
         def parts(arrays: Any, numbers: Array, layout: Layout) -> tuple[Scenario, Any, Any, World]:
@@ -60,7 +70,9 @@ class Program:
         @jax.jit
         def step(arrays: Any, numbers: Array, memory: Any) -> tuple[Array, Any]:
             changed, policy, given, world = parts(arrays, numbers, self.inputs)
-            return _step(changed, policy, make_shield(shield, changed), world, given, memory, self.outputs)
+            commanded = commands(changed, policy, world, given)
+            after = one_period(changed, make_shield(shield, changed), world, commanded, given, memory)
+            return self.outputs.joined(after[0]), after[1]
 
         @jax.jit
         def begin(arrays: Any, numbers: Array) -> Any:
@@ -75,7 +87,10 @@ class Program:
         self.shield = shield
         self._step, self._begin, self._plan = step, begin, plan
         self._dtype = real(0.0).dtype
-        self.plans = make_shield(shield, scenario).looks_ahead and m > 0 and k > 0
+        self.plans = (
+            make_shield(shield, scenario).looks_ahead
+            and min(scenario.pursuer_count, scenario.obstacle_count) > 0
+        )
 
     def vector(self, given: dict[str, Any]) -> np.ndarray:
         """The input vector."""
@@ -129,30 +144,63 @@ def traced(scenario: Scenario, policy: Callable[..., Any]) -> Any:
     return eqx.filter((scenario, policy), eqx.is_array)
 
 
-def _step(
-    scenario: Scenario,
-    policy: Callable[..., Any],
-    shield: Shield,
-    world: World,
-    given: dict[str, Any],
-    memory: Any,
-    outputs: Layout,
-) -> tuple[Array, Any]:
+class _Commanded(eqx.Module):
+    """Pursuers that drive as commanded, `wheels (m, 2)` in m/s."""
+
+    wheels: Array
+
+    def steer_all(self, scenario: Scenario, world: World) -> Array:
+        """The commanded wheel speeds."""
+        return self.wheels
+
+    def __call__(self, scenario: Scenario, world: World, key: Any) -> Array:
+        """Those of the first pursuer alone."""
+        return self.wheels[0]
+
+
+def commands(
+    scenario: Scenario, policy: Callable[..., Any], world: World, given: dict[str, Any]
+) -> tuple[Array, Array]:
+    """What policy and pursuers ask for: the nominal velocity (2,), which is `held` unless the policy is to be
+    asked, and wheel speeds (m, 2), m/s. `given`: inputs named by `layouts`."""
     nominal = jax.lax.cond(
         given["ask"] > 0.0, lambda: decide(scenario, policy, world), lambda: real(given["held"])
     )
-    key = jax.random.fold_in(jax.random.key(0), given["count"].astype(jnp.int32))
+    # A raw key: programs are also translated, and a typed one hides its words.
+    key = jax.random.fold_in(jax.random.PRNGKey(0), given["count"].astype(jnp.int32))
     pursuers = PursuerControl(given["strategy"].astype(jnp.int32), given["mode"], given["command"], key)
-    step = control_step(scenario, shield, pursuers, world, memory, nominal, key)
+    return nominal, pursuers.steer_all(scenario, world)
+
+
+def one_period(
+    scenario: Scenario,
+    shield: Shield,
+    world: World,
+    commanded: tuple[Array, Array],
+    given: dict[str, Any],
+    memory: Any,
+) -> tuple[dict[str, Any], Any]:
+    """One control period of the page: the outputs named by `layouts`, and the shield's next memory.
+
+    Beside the world that physics leaves (m, m/s, rad, s) there is what the page goes on with: `next_target`,
+    which is another one where it was reached or `renew` is set, and the obstacles as they have `turned`.
+
+    **Arguments:** `commanded` by `commands`; `given`: `renew` and `draws`.
+    """
+    nominal, wheels = commanded
+    step = control_step(scenario, shield, _Commanded(wheels), world, memory, nominal, None)
     moved, memory, events, result, wheels = step
     rows = _rows(scenario, shield, world, memory)
     h = jax.vmap(lambda pose: _level(scenario, world, pose))(world.pursuers)
-    parts = {name: getattr(moved, name) for name in World.__annotations__ if name in outputs.shapes}
+    renewed = events.reached | (given["renew"] > 0.0)
+    target = jnp.where(renewed, another_target(scenario, moved, given["draws"]), moved.target)
+    parts = {name: getattr(moved, name) for name in layouts(scenario)[0].shapes}
     parts |= {name: getattr(events, name) for name in EVENTS}
     parts |= {"nominal": nominal, "action": result.action, "wheels": wheels, "status": result.status}
     parts |= {"barriers": result.barriers, "slack": result.slack, "intervention": result.intervention}
     parts |= {"h": h, "normals": rows.normals, "offsets": rows.offsets, "looking": shield.has_plan(memory)}
-    return outputs.joined(parts), memory
+    parts |= {"next_target": target, "turned": turned_back(scenario, moved)}
+    return parts, memory
 
 
 def _level(scenario: Scenario, world: World, pose: Any) -> Array:

@@ -11,7 +11,7 @@ import socket
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +21,11 @@ from sidestep.loop import Trajectory, save_trajectory
 from sidestep.loop.policies import as_policy
 from sidestep.safety.shields.catalogue import SHIELDS
 from sidestep.views.play.control import STRATEGIES
+from sidestep.views.play.greeting import greeting
 from sidestep.views.play.limits import Limits
 from sidestep.views.play.origins import is_known_host, is_own_origin
 from sidestep.views.play.programs import Programs
-from sidestep.views.play.sliders import PACES, YOU
+from sidestep.views.play.sliders import YOU
 from sidestep.world import Scenario
 
 if TYPE_CHECKING:
@@ -77,6 +78,11 @@ class PlayError(ValueError):
     """The page cannot be served; the message says what to install or change."""
 
 
+def endless(scenario: Scenario) -> Scenario:
+    """The scenario without a time limit."""
+    return replace(scenario, episode_steps=_ENDLESS)
+
+
 def make_app(hosting: Hosting) -> Any:
     """The page as an ASGI application. Its `state` has the `visitors` by token and the `programs`.
 
@@ -94,9 +100,9 @@ def make_app(hosting: Hosting) -> Any:
     from sidestep.views.play.session import Session
     from sidestep.views.play.visitor import Gone, Visitor
 
-    _check(hosting)
+    check_hosting(hosting)
     limits = hosting.limits
-    scenario = replace(hosting.scenario, episode_steps=_ENDLESS)
+    scenario = endless(hosting.scenario)
     programs = Programs(scenario, as_policy(hosting.policy, scenario))
     workers = ThreadPoolExecutor(max(os.cpu_count() or 1, 2), thread_name_prefix="sidestep-play")
     savers: dict[str, Saver] = {"npz": _save_npz, **hosting.savers}
@@ -154,7 +160,7 @@ def make_app(hosting: Hosting) -> Any:
                     raise Gone("closed") from error
 
             visitor = Visitor(session, limits, workers, receive, send)
-            await visitor.run(_greeting(hosting, session, token, list(savers)))
+            await visitor.run(greeting(session.base, hosting.policy, token=token, formats=list(savers)))
         except (Gone, WebSocketDisconnect):
             pass
         finally:
@@ -219,33 +225,14 @@ async def _refuse(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": text})
 
 
-def _check(hosting: Hosting) -> None:
+def check_hosting(hosting: Hosting) -> None:
+    """**Raises** `ValueError` for an unknown shield or pursuer, or a number out of its bounds."""
     if hosting.shield not in SHIELDS:
         raise ValueError(f"no shield {hosting.shield!r}; use one of {', '.join(map(repr, SHIELDS))}")
     if hosting.pursuer not in (YOU, *STRATEGIES):
         raise ValueError(f"no pursuer {hosting.pursuer!r}; use {YOU} or one of {', '.join(STRATEGIES)}")
     check(hosting)
     check(hosting.limits)
-
-
-def _greeting(hosting: Hosting, session: Session, token: str, formats: list[str]) -> dict[str, Any]:
-    """The page's constant data."""
-    scenario = session.base
-    return {
-        "type": "hello",
-        "token": token,
-        "formats": formats,
-        "shields": list(SHIELDS),
-        "pursuers": [YOU, *STRATEGIES],
-        "sliders": [asdict(slider) for slider in session.sliders.values()],
-        "defaults": dict(session.numbers),
-        "paces": list(PACES),
-        "period": session.period,
-        "arena": float(scenario.arena_side),
-        "reach": float(scenario.reach_distance),
-        "counts": [scenario.pursuer_count, scenario.obstacle_count],
-        "policy": hosting.policy if isinstance(hosting.policy, str) else "learned",
-    }
 
 
 def _written(session: Session, saver: Saver, suffix: str) -> bytes:

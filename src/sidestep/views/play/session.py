@@ -6,6 +6,7 @@ from typing import Any, final
 
 import numpy as np
 
+from sidestep._arrays import real
 from sidestep.safety.certificate.situation import plain
 from sidestep.safety.filter.status import Status
 from sidestep.views.play import control
@@ -29,25 +30,20 @@ from sidestep.views.play.messages import (
 from sidestep.views.play.program import traced
 from sidestep.views.play.programs import Programs
 from sidestep.views.play.recording import Recording
+from sidestep.views.play.rules import PATIENCE, TRIES, is_touching
 from sidestep.views.play.score import Score
 from sidestep.views.play.sliders import YOU, drifts_at, numbers_of, sliders_for, with_numbers
 from sidestep.views.play.verdict import quick_verdict, verdict
-from sidestep.world import Scenario
+from sidestep.world import Scenario, World
 
-_EDGE = 0.4
-"""Distance (m) beyond the square of the starts at which an obstacle reverses."""
-_CLEAR = 1.0
-"""Obstacles do not reverse within this distance (m) of the robot."""
 _PLAN_EVERY = 5
-_PATIENCE = 30.0
-"""Time (s) after which an unreached target is replaced, because a pursuer may block it."""
 
 
 @final
 class Session:
     """A world simulated period by period, for one visitor. Not thread-safe.
 
-    The robot drives from target to target: a target that is reached, or not reached within `_PATIENCE`, is
+    The robot drives from target to target: a target that is reached, or not reached within `PATIENCE`, is
     replaced. A capture or a collision ends the episode (`outcome`); `restart` begins the next. While the
     shield's program is being compiled, `advance` does nothing.
     """
@@ -154,6 +150,8 @@ class Session:
                 "mode": mode if self.pursuer == YOU else control.BY_STRATEGY,
                 "command": self._drive.toward or self._drive.wheels or (0.0, 0.0),
                 "count": self._count % 2**20,
+                "renew": self._waited + self.period > PATIENCE,
+                "draws": self._random.uniform(-1.0, 1.0, (TRIES, 2)),
             }
         )
         if self._memory is None:
@@ -165,10 +163,10 @@ class Session:
         output = self._output = program.outputs.split(np.asarray(result, np.float64))
         self._recording.add(vector[: program.place.size], result)
         self._parts = {name: output[name] for name in program.place.shapes}
+        self._parts |= {"target": output["next_target"], "obstacles": output["turned"]}
         self._held, self._count = output["nominal"], self._count + 1
         self.score.lasted(self.shield, self.period)
         self._judge(output)
-        self._turn_obstacles_back()
 
     def _judge(self, output: dict[str, Any]) -> None:
         tally = self.score.of(self.shield)
@@ -181,36 +179,8 @@ class Session:
         elif output["reached"] > 0.0:
             tally.reached += 1
         self._waited += self.period
-        if output["reached"] > 0.0 or self._waited > _PATIENCE:
-            self._parts["target"] = self._another_target()
+        if output["reached"] > 0.0 or self._waited > PATIENCE:
             self._waited = 0.0
-
-    def _another_target(self) -> np.ndarray:
-        """A point in the square of the starts, clear of all robots if one is found in 200 tries."""
-        half = 0.45 * float(self.base.arena_side)
-        clear = self.numbers["collision_distance"] + 0.15
-        tip = self.numbers["capture_distance"] + 0.15
-        for _ in range(200):
-            place = self._random.uniform(-half, half, 2)
-            far = np.hypot(*(place - self._parts["evader"])) >= float(self.base.target_separation)
-            if (
-                far
-                and np.all(_distances(self._parts["obstacles"], place) > clear)
-                and np.all(_distances(self._parts["pursuers"], place) > tip)
-            ):
-                break
-        return place
-
-    def _turn_obstacles_back(self) -> None:
-        """Reverse obstacles that leave the arena, because they move straight."""
-        edge = 0.5 * float(self.base.arena_side) + _EDGE
-        obstacles = self._parts["obstacles"].copy()
-        away = _distances(obstacles, self._parts["evader"]) > _CLEAR
-        for axis in (0, 1):
-            leaving = obstacles[:, axis] * obstacles[:, 2 + axis] > 0.0
-            turns = (np.abs(obstacles[:, axis]) > edge) & leaving & away
-            obstacles[turns, 2 + axis] *= -1.0
-        self._parts["obstacles"] = obstacles
 
     # Changes of the world by messages.
 
@@ -252,7 +222,7 @@ class Session:
         self._set_numbers(numbers)
         if faster:
             obstacles = self._parts["obstacles"].copy()
-            obstacles[:, 2:] = drifts_at(obstacles[:, 2:], numbers["obstacle_speed"])
+            obstacles[:, 2:] = np.asarray(drifts_at(obstacles[:, 2:], numbers["obstacle_speed"]))
             self._parts["obstacles"] = obstacles
         if self._touching():
             self.restart()
@@ -262,10 +232,7 @@ class Session:
 
     def _touching(self) -> bool:
         """Whether the robot is captured or collides in the current world."""
-        evader, numbers = self._parts["evader"], self.numbers
-        caught = _distances(self._parts["pursuers"], evader) <= numbers["capture_distance"]
-        collided = _distances(self._parts["obstacles"], evader) <= numbers["collision_distance"]
-        return bool(np.any(caught) or np.any(collided))
+        return bool(is_touching(self.scenario, World(**{name: real(v) for name, v in self._parts.items()})))
 
     def _move(self, message: Move) -> None:
         if not self.paused:
@@ -377,7 +344,3 @@ class Session:
 
 def _rounded(values: Any) -> Any:
     return np.round(np.asarray(values, float), 5).tolist()
-
-
-def _distances(robots: Any, place: Any) -> Any:
-    return np.hypot(robots[:, 0] - place[0], robots[:, 1] - place[1])

@@ -8,9 +8,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from sidestep._arrays import real
+from sidestep._arrays import length, real
 from sidestep._bounds import allowed
 from sidestep.safety.certificate.situation import plain
 from sidestep.world import Scenario
@@ -19,6 +21,7 @@ PACES = (0.02, 4.0)
 """Least and largest number of simulated seconds per second."""
 YOU = "you"
 """The name of a pursuer driven by the visitor."""
+_AHEAD = np.array([1.0, 0.0], np.float32)
 _TIP_ROOM = 0.3
 """Least distance (m) of a start from the tip of the capture set."""
 
@@ -68,24 +71,21 @@ def numbers_of(scenario: Scenario) -> dict[str, float]:
     return {**numbers, "obstacle_speed": round(math.hypot(*drift), 6)}
 
 
-def with_numbers(scenario: Scenario, numbers: Mapping[str, float]) -> Scenario:
-    """The scenario with these slider values; separations of starts grow with the distances."""
+def with_numbers(scenario: Scenario, numbers: Mapping[str, Any]) -> Scenario:
+    """The scenario with these slider values, which may be traced; separations of starts grow with the
+    distances."""
     fields = {name: value for name, value in numbers.items() if name != "obstacle_speed"}
-    changed = _replaced(scenario, fields)
     if "obstacle_speed" in numbers:
-        changed = eqx.tree_at(
-            lambda s: s.obstacle_velocity,
-            changed,
-            real(_rescaled(np.asarray(scenario.obstacle_velocity, float), numbers["obstacle_speed"])),
-        )
-    ratio = min(float(changed.evader_speed) / float(changed.pursuer_speed), 1.0)
-    tip = float(changed.capture_distance) / ratio
+        fields["obstacle_velocity"] = drifts_at(scenario.obstacle_velocity, numbers["obstacle_speed"])
+    changed = _replaced(scenario, fields)
+    ratio = jnp.minimum(changed.evader_speed / changed.pursuer_speed, 1.0)
+    tip = changed.capture_distance / ratio
     return _replaced(
         changed,
         {
-            "initial_separation": max(float(scenario.initial_separation), tip + _TIP_ROOM),
-            "obstacle_separation": max(
-                float(scenario.obstacle_separation), 1.5 * float(changed.collision_distance)
+            "initial_separation": jnp.maximum(scenario.initial_separation, tip + _TIP_ROOM),
+            "obstacle_separation": jnp.maximum(
+                scenario.obstacle_separation, 1.5 * changed.collision_distance
             ),
         },
     )
@@ -100,15 +100,9 @@ def _replaced(scenario: Scenario, fields: Mapping[str, Any]) -> Scenario:
     )
 
 
-def _rescaled(velocity: Any, speed: float) -> Any:
-    """`velocity` (n, 2) or (2,) scaled to this speed (m/s); along +x if it was zero."""
-    velocity = np.asarray(velocity, float)
-    length = np.hypot(velocity[..., 0], velocity[..., 1])[..., None]
-    ahead = np.zeros_like(velocity)
-    ahead[..., 0] = 1.0
-    return speed * np.where(length > 0.0, velocity / np.where(length > 0.0, length, 1.0), ahead)
-
-
-def drifts_at(velocities: Any, speed: float) -> Any:
-    """Velocities (k, 2) of obstacles scaled to this speed (m/s)."""
-    return _rescaled(velocities, speed)
+def drifts_at(velocities: Any, speed: Any) -> Float[Array, "*n 2"]:
+    """Velocities (*n, 2) of obstacles scaled to this speed (m/s); along +x where they were zero."""
+    velocities = real(velocities)
+    lengths = length(velocities[..., 0], velocities[..., 1])[..., None]
+    directions = jnp.where(lengths > 0.0, velocities / jnp.where(lengths > 0.0, lengths, 1.0), _AHEAD)
+    return real(speed) * directions

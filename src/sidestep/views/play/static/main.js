@@ -50,12 +50,14 @@ const connection = new Connection({
     byId("task").textContent = task(message);
     document.body.dataset.ready = message.ready ? "yes" : "no";
     byId("warming").hidden = message.ready;
-    const failed = message.states[message.shield] === "failed";
-    byId("warming-title").textContent = failed ? "This shield could not be compiled" : `Warming up the shield ${message.shield}`;
-    byId("warming-text").textContent = failed
-      ? "The server's log says why. Choose another one."
-      : "It is being compiled: half a minute the first time on this computer, a moment from then on.";
-    byId("warming-none").hidden = message.shield === "none" || message.states.none !== "ready";
+    const warming = WARMING[message.states[message.shield]] ?? WARMING.warming;
+    const instead = byId("warming-none");
+    byId("warming").dataset.state = message.states[message.shield];
+    byId("warming-title").textContent = warming.title.replace("SHIELD", message.shield);
+    byId("warming-text").textContent = warming.text.replace("SHIELD", message.shield);
+    instead.textContent = warming.offer;
+    instead.value = warming.instead;
+    instead.hidden = message.shield === warming.instead || message.states[warming.instead] !== "ready";
     if (!message.paused) state.chosen = null;
     hint();
   },
@@ -88,6 +90,24 @@ const connection = new Connection({
     say(full ? "No room just now" : "Connection lost", full ? "Others are playing; trying again." : "Trying again.", 6e5);
   },
 });
+
+// Said while a shield cannot run, with another one that can.
+const WARMING = {
+  warming: {
+    title: "Warming up the shield SHIELD",
+    text: "It is being compiled: half a minute the first time on this computer, a moment from then on.",
+    instead: "none", offer: "Meanwhile, catch it without a shield",
+  },
+  failed: {
+    title: "This shield could not be compiled", text: "The server's log says why. Choose another one.",
+    instead: "none", offer: "Meanwhile, catch it without a shield",
+  },
+  missing: {
+    title: "No clearance table for these numbers",
+    text: "On this page SHIELD goes by such tables, and looks ahead only in the installed package.",
+    instead: "game", offer: "Take the shield game",
+  },
+};
 
 function task(setup) {
   if (setup.pursuer === "you") return "You drive the pursuer. Catch the blue robot.";
@@ -322,7 +342,7 @@ addEventListener("keydown", (event) => {
   }
 });
 
-byId("warming-none").addEventListener("click", () => connection.send({ type: "pick", shield: "none" }));
+byId("warming-none").addEventListener("click", (event) => connection.send({ type: "pick", shield: event.target.value }));
 document.addEventListener("visibilitychange", () => {
   // A page that nobody sees need not be computed.
   if (document.hidden && state.setup && !state.setup.paused) {

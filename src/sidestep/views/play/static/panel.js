@@ -131,8 +131,9 @@ export class Panel {
   take(setup) {
     this.setup = setup;
     byId(`shield-${setup.shield}`).checked = true;
-    const chances = setup.shield === "game" || setup.shield === "joint" ? ` ${CHANCES[setup.verdict.kind]}` : "";
-    byId("shield-words").textContent = (SHIELDS[setup.shield] ?? "") + chances;
+    const plays = setup.ready && (setup.shield === "game" || setup.shield === "joint");
+    const chances = plays ? ` ${CHANCES[setup.verdict.kind]}` : "";
+    byId("shield-words").textContent = (setup.words ?? SHIELDS[setup.shield] ?? "") + chances;
     byId("pursuer").value = setup.pursuer;
     for (const [name, value] of Object.entries(setup.numbers)) {
       const range = byId(`slider-${name}`);
