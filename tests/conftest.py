@@ -4,8 +4,10 @@ The environment variables are set in the conftest.py of the root. Nothing here i
 level: the jaxtyping plugin has to wrap it first.
 """
 
+import inspect
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 
 import jax
@@ -46,6 +48,33 @@ def need_program() -> Callable[..., str]:
         pytest.skip(message)
 
     return need
+
+
+_OFTEN_CALLED = ("sidestep.safety.sampled.flow_map", "sidestep.safety.sampled.sampled_game")
+_THEIR_TESTS = "test_certificate_bounds.py"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _often_called_functions_are_checked_by_their_own_tests(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A certificate calls these 100,000 times with a few numbers: checking types took most of that time."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.name != _THEIR_TESTS:
+            for name in _OFTEN_CALLED:
+                for one in _functions(sys.modules.get(name)):
+                    # The decorator that checks asks for this at every call.
+                    patch.setattr(one, "__no_type_check__", True, raising=False)
+        yield
+
+
+def _functions(module: object) -> Iterator[Callable[..., object]]:
+    """The functions that a module defines, those of its classes included."""
+    name = getattr(module, "__name__", None)
+    mine = [one for one in vars(module).values() if getattr(one, "__module__", None) == name] if name else []
+    for one in mine:
+        for part in vars(one).values() if inspect.isclass(one) else [one]:
+            part = part.fget if isinstance(part, property) else part
+            if inspect.isfunction(part):
+                yield part
 
 
 _MOST_MEMORY = 3 * 2**30
