@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import pytest
@@ -48,6 +49,23 @@ def need_program() -> Callable[..., str]:
         pytest.skip(message)
 
     return need
+
+
+_LONGEST_FIRST = (
+    "safety/test_table_shield.py", "loop/test_planner.py", "safety/test_joint.py", "test_project.py",
+    "safety/test_clearance.py", "test_resuming.py", "views/test_report.py", "safety/test_clearance_wall.py",
+    "plants/test_twin_episode.py", "safety/test_filter_optimality.py", "learning/test_training.py",
+    "safety/test_nearest_changes.py", "plants/test_flight.py", "safety/test_lanes.py",
+    "safety/test_budget.py", "bridges/test_campaigns.py", "safety/test_certificate_obstacles.py",
+    "safety/test_certificate.py", "trials/test_reproduction.py", "learning/test_pretrained.py",
+    "benchmarks/test_kills.py", "test_unwritable_outputs.py", "test_cli.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take longest go first: begun last, one would leave the other workers idle."""
+    place = {Path(__file__).parent / name: index for index, name in enumerate(_LONGEST_FIRST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
 _OFTEN_CALLED = ("sidestep.safety.sampled.flow_map", "sidestep.safety.sampled.sampled_game")
