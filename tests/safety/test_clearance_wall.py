@@ -152,28 +152,27 @@ def two_seconds():
 
 def test_a_very_large_disc_is_a_wall(two_seconds):
     """For the same nodes and time: the disc bends by s^2/(2 d) along the wall."""
-    results = []
-    for game, most in ((FASTER, 1.0), (replace(FASTER, collision_distance=16.0, wall=False), 18.0)):
-        fresh = np.full_like(two_seconds.clearance, game.collision_distance)
-        begun = two_seconds._replace(clearance=fresh, after=fresh, sweeps=0, change=math.inf)
-        solved = solve(game, COARSE, periods=40, most=most, begun=begun)
-        results.append(solved.clearance - game.collision_distance)
-    assert np.max(results[0]) > 0.1
-    np.testing.assert_allclose(results[1], results[0], atol=0.005)
+    disc = replace(FASTER, collision_distance=16.0, wall=False)
+    fresh = np.full_like(two_seconds.clearance, disc.collision_distance)
+    begun = two_seconds._replace(clearance=fresh, after=fresh, sweeps=0, change=math.inf)
+    solved = solve(disc, COARSE, periods=40, most=18.0, begun=begun)
+    beyond = two_seconds.clearance - FASTER.collision_distance
+    assert np.max(beyond) > 0.1
+    np.testing.assert_allclose(solved.clearance - disc.collision_distance, beyond, atol=0.005)
 
 
 def test_against_a_faster_pursuer_no_distance_does_for_ever():
-    """It herds the evader at a steady rate: every two seconds ask for as much more."""
+    """It herds the evader at a steady rate: from the fourth second on each asks for as much more."""
     needed = {}
 
     def note(solution):
-        if solution.stage == 2 and solution.sweeps % 40 == 0:
+        if solution.stage == 2 and solution.sweeps % 20 == 0:
             needed[solution.sweeps] = float(np.max(solution.clearance))
 
-    solve(FASTER, replace(COARSE, height=0.006, growth=1.5, angles=48), periods=160, progress=note)
-    rises = np.diff([needed[sweeps] for sweeps in (40, 80, 120, 160)])
-    assert np.all(rises > 0.03)
-    assert rises[2] == pytest.approx(rises[1], rel=0.2)
+    solve(FASTER, replace(COARSE, height=0.006, growth=1.5, angles=48), periods=120, progress=note)
+    rises = np.diff([needed[sweeps] for sweeps in (80, 100, 120)])
+    assert np.all(rises > 0.015)
+    assert rises[1] == pytest.approx(rises[0], rel=0.2)
 
 
 def test_a_wall_is_taken_for_no_disc(table, tmp_path):

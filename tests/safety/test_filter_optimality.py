@@ -113,8 +113,10 @@ def test_gradients_are_true_where_they_exist(x64, problems, circle):
     def both(point, tangent):
         forward = jax.jvp(f, point, tangent)[1]
         step = lambda h: f(*(p + h * t for p, t in zip(point, tangent, strict=True)))  # noqa: E731
-        h = 1e-6
-        differences = [(step(s * h) - step(-s * h)) / (2.0 * s * h) for s in (1.0, 0.5)]
+        h = jnp.array([1e-6, 0.5e-6])
+        # All four steps in one: a program with the filter in it once is compiled sooner.
+        ahead, behind = jax.vmap(jax.vmap(step))(jnp.stack([h, -h]))
+        differences = (ahead - behind) / (2.0 * h[:, None])
         _, back = jax.vjp(f, *point)
         cotangent = back(forward)
         return (
@@ -124,7 +126,8 @@ def test_gradients_are_true_where_they_exist(x64, problems, circle):
             jnp.sum(forward**2),
         )
 
-    forward, (wide, narrow), reverse, square = both(point, tangent)
+    forward, differences, reverse, square = both(point, tangent)
+    wide, narrow = differences[:, 0], differences[:, 1]
     assert np.all(np.isfinite(forward))
     np.testing.assert_allclose(reverse, square, rtol=1e-6, atol=1e-12)
     scale = 1.0 + np.abs(np.asarray(forward)).max(axis=1)

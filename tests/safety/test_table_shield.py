@@ -21,6 +21,10 @@ from sidestep.world import World
 SCENARIO = load_scenario("paper-0.15")
 SHIELD = make_shield("joint:table", SCENARIO)
 ASK = eqx.filter_jit(lambda shield, world, nominal: shield(world, nominal, shield.init(world))[0])
+AFTER = eqx.filter_jit(
+    lambda shield, world, actions: jax.vmap(lambda u: shield._margin_after(world, u))(actions)
+)
+"""Margins after a period, (n, 2), of actions (n, 2)."""
 
 
 def world_of(evader, obstacle):
@@ -131,8 +135,8 @@ def test_pursuers_go_first_where_not_both_margins_can_be_kept():
     result = ASK(shield, world, jnp.array([-0.1574, 0.0]))
     assert int(result.status) == Status.INFEASIBLE
     options = 0.1574 * jnp.stack([jnp.cos(a := jnp.linspace(-3.1, 3.1, 100)), jnp.sin(a)], -1)
-    after = np.asarray(jax.vmap(lambda u: shield._margin_after(world, u))(options))
-    got = np.asarray(shield._margin_after(world, result.action))
+    after = np.asarray(AFTER(shield, world, options))
+    (got,) = np.asarray(AFTER(shield, world, result.action[None]))
     assert got[0] >= min(after[:, 0].max(), 0.0) - 1e-4
     assert got[1] < 0.0
 
@@ -177,18 +181,18 @@ def test_an_unhindered_action_passes_and_a_deadly_one_does_not():
 
 
 def test_the_nearest_velocity_that_keeps_the_margin_is_taken_among_all_it_may_choose():
-    generator = np.random.default_rng(0)
+    generator, margin_of = np.random.default_rng(0), jax.jit(lambda world: SHIELD.margin(world))
     checked = 0
     for _ in range(40):
         angle, distance = generator.uniform(-math.pi, math.pi), generator.uniform(0.24, 0.6)
         obstacle = [0.22 + distance * math.cos(angle), 0.03 + distance * math.sin(angle)]
         world = world_of([0.22, 0.03], obstacle)
-        least = float(SHIELD.margin(world))
+        least = float(margin_of(world))
         if least < 0.0:
             continue
         nominal = 0.15 * np.array([math.cos(angle), math.sin(angle)])
         result = ASK(SHIELD, world, nominal)
-        margin = float(jnp.min(SHIELD._margin_after(world, result.action)))
+        margin = float(jnp.min(AFTER(SHIELD, world, result.action[None])))
         assert margin >= 0.0
         if int(result.status) == Status.CORRECTED and margin >= 0.8 * least:
             checked += 1
@@ -196,11 +200,9 @@ def test_the_nearest_velocity_that_keeps_the_margin_is_taken_among_all_it_may_ch
             headings = np.linspace(-math.pi, math.pi, 200)
             for speed in (0.1574, 0.0787):
                 others = speed * np.stack([np.cos(headings), np.sin(headings)], -1)
-                after = jax.vmap(lambda u, world=world: jnp.min(SHIELD._margin_after(world, u)))(
-                    jnp.asarray(others)
-                )
+                after = np.min(np.asarray(AFTER(SHIELD, world, jnp.asarray(others))), axis=-1)
                 nearer = np.linalg.norm(others - nominal, axis=-1) < float(result.intervention) - 0.012
-                assert not np.any(np.asarray(after)[nearer] >= 0.8 * least + 1e-5)
+                assert not np.any(after[nearer] >= 0.8 * least + 1e-5)
     assert checked
 
 
@@ -241,7 +243,7 @@ def test_any_number_of_robots(pursuers, obstacles):
         assert result.reached >= 0.9 * count
     worlds = jax.vmap(scenario.reset)(jax.random.split(jax.random.key(1), 3))
     nominal = jnp.full((3, 2), 0.1)
-    together = jax.vmap(lambda w, n: shield(w, n, shield.init(w))[0])(worlds, nominal)
+    together = eqx.filter_jit(jax.vmap(ASK, in_axes=(None, 0, 0)))(shield, worlds, nominal)
     for i in range(3):
         alone = ASK(shield, jax.tree.map(lambda leaf, i=i: leaf[i], worlds), nominal[i])
         np.testing.assert_allclose(together.action[i], alone.action, atol=1e-6)

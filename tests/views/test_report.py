@@ -12,7 +12,7 @@ from sidestep.loop import save_trajectory
 from sidestep.store.files import write_json
 from sidestep.store.runs import RunError, append_metrics, create_run
 from sidestep.trials import wilson_interval
-from sidestep.views import load_run, write_report
+from sidestep.views import load_run, style, write_report
 
 
 class Links(HTMLParser):
@@ -59,6 +59,22 @@ def evaluation(captured=12):
         }
     rates = ("intervention_rate", "infeasible_rate", "mean_correction", "min_pursuer_clearance")
     return report | dict.fromkeys(rates, 0.01)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """For tests of the words only: figures are made and not rendered, which takes most of the time."""
+    dot = base64.b64decode(
+        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+    )
+
+    def save(figure, path):
+        png, pdf = style.figure_files(path)
+        png.parent.mkdir(parents=True, exist_ok=True)
+        png.write_bytes(dot)
+        return png, pdf
+
+    monkeypatch.setattr(style, "save", save)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +131,7 @@ def test_report_says_what_the_data_say(whole):
     assert "Game shield: 2 episodes, 100 periods, of which 50.0 % further off than drawn" in words
 
 
-def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, tmp_path, run_of):
+def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, quick, tmp_path, run_of):
     assert "joint shield adds" not in read(whole).words
     runs = [run_of(shield) for shield in ("joint", "game", "none", "paper")]
     words = read(write_report(runs, tmp_path / "r.html")).words
@@ -129,7 +145,7 @@ def test_shields_stand_in_one_order_and_only_those_shown_are_explained(whole, tm
     assert "Faint" in read(whole).words
 
 
-def test_report_escapes_what_it_shows(tmp_path, run_of, survey_of):
+def test_report_escapes_what_it_shows(quick, tmp_path, run_of, survey_of):
     run = run_of("</script><script>alert(1)//")
     config = {**run.config, "pursuer": "<script>alert(1)</script>"}
     run = replace(run, config=config, survey=survey_of())
@@ -179,7 +195,7 @@ def test_report_of_a_run_folder(tmp_path, chase, run_of):
     assert json.loads((folder / "config.json").read_text())["shield"] == "game"
 
 
-def test_runs_of_other_scenarios_are_not_compared_in_silence(whole, tmp_path, run_of):
+def test_runs_of_other_scenarios_are_not_compared_in_silence(whole, quick, tmp_path, run_of):
     one, other = run_of("game"), run_of("joint")
     faster = {**other.config["scenario"], "pursuer_speed": 0.25}
     runs = [one, replace(other, config={**other.config, "scenario": faster})]

@@ -41,9 +41,14 @@ class Label(Annotation):
 def place_labels(figure: Figure) -> None:
     """Move every `Label` to its first place inside the axes that covers no text and no labelled point; hide
     labels without such a place."""
+    found = {
+        axes: [child for child in axes.get_children() if isinstance(child, Label)] for axes in figure.axes
+    }
+    if not any(found.values()):
+        return
+    # Texts have their places only once the figure has been laid out.
     figure.draw_without_rendering()
-    for axes in figure.axes:
-        labels = [child for child in axes.get_children() if isinstance(child, Label)]
+    for axes, labels in found.items():
         if labels:
             _place(axes, sorted(labels, key=lambda label: label.rank))
 
