@@ -51,6 +51,8 @@ def circling(chase):
 
 def texts(figure):
     """Every text that is seen, with its box in pixels."""
+    # Texts have their places only once the figure has been laid out.
+    figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()
     found = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible())
     ticks = {tick for axes in figure.axes for tick in _hidden_ticks(axes)}
