@@ -66,7 +66,7 @@ def test_a_held_velocity_keeps_the_set_and_touching_distance_does_not(table):
 
 def test_a_distant_pursuer_leaves_all_but_the_wall_itself(table):
     phi = np.linspace(-math.pi, math.pi, 50)
-    _, clearance = jax.vmap(table, in_axes=(None, 0))(
+    _, clearance = jax.jit(jax.vmap(table, in_axes=(None, 0)))(
         np.array([0.6, 0.1]), np.stack([np.cos(phi), np.sin(phi)], -1)
     )
     np.testing.assert_allclose(clearance, SLOWER.collision_distance, atol=0.002)
@@ -86,10 +86,11 @@ def test_mirror_and_reverse_are_the_same_state(table):
 def test_only_moves_along_the_normal_count(table):
     z, poses = jnp.array([0.3, 0.2]), jnp.zeros((1, 3))
     offset, along, beside = jnp.array([0.0, 0.2]), jnp.array([0.0, -0.005]), jnp.array([0.005, 0.0])
-    now = table.margin(z, offset)
-    assert table.margin_after(z, offset, beside, poses, 0.0) == pytest.approx(float(now), abs=1e-4)
-    assert table.margin_after(z, offset, along, poses, 0.0) == pytest.approx(float(now) - 0.005, abs=1e-4)
-    beyond = table.margin_after(z, jnp.array([0.0, 0.001]), along, poses, 0.0)
+    now = float(jax.jit(lambda z, p: table.margin(z, p))(z, offset))
+    after = jax.jit(lambda offset, move: table.margin_after(z, offset, move, poses, 0.0))
+    assert float(after(offset, beside)) == pytest.approx(now, abs=1e-4)
+    assert float(after(offset, along)) == pytest.approx(now - 0.005, abs=1e-4)
+    beyond = after(jnp.array([0.0, 0.001]), along)
     assert float(beyond) < -SLOWER.collision_distance
 
 

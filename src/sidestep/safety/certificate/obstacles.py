@@ -7,9 +7,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from sidestep.safety.clearance import (
     Checked,
@@ -180,8 +182,12 @@ def clearances(table: ClearanceTable, z: np.ndarray, count: int = 720) -> tuple[
     towards = np.linspace(-math.pi, math.pi, count, endpoint=False)
     # The table's direction is that from the obstacle to the evader.
     offsets = -np.stack([np.cos(towards), np.sin(towards)], -1)
-    look = jax.vmap(lambda offset: table(jnp.asarray(z), offset)[1])
-    return towards, np.asarray(look(jnp.asarray(offsets)), float)
+    return towards, np.asarray(_needed(table, jnp.asarray(z), jnp.asarray(offsets)), float)
+
+
+@eqx.filter_jit
+def _needed(table: ClearanceTable, z: Float[Array, "2"], offsets: Float[Array, "n 2"]) -> Float[Array, "n"]:
+    return jax.vmap(lambda offset: table(z, offset)[1])(offsets)
 
 
 def _over_directions(table: ClearanceTable, z: np.ndarray) -> tuple[float, float, float]:
