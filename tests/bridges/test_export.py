@@ -12,10 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.bridges.export import export_jax, export_onnx
-from sidestep.bridges.export.exported import Exported
+from sidestep.bridges.export import NotTranslatable, export_jax, export_onnx
+from sidestep.bridges.export.exported import Exported, Field
+from sidestep.bridges.export.graph import Graph
+from sidestep.bridges.export.onnx_code import write_numbers
 from sidestep.bridges.export.parity import answers as reference
 from sidestep.bridges.export.parity import random_states
+from sidestep.bridges.export.program import Program
+from sidestep.bridges.export.translate import translate
 from sidestep.learning import Actor, LearnedPolicy, write_policy
 from sidestep.loop.step import decide
 from sidestep.safety import Budget, GameShield, Status, make_shield
@@ -232,6 +236,13 @@ def test_what_a_graph_cannot_hold_is_refused_by_name(robot, tmp_path):
     with pytest.raises(ValueError, match=r"looks ahead here.*'joint:table'"):
         export_onnx(path, robot.scenario, robot.policy, shield=make_shield("joint", robot.scenario))
     assert not path.exists()
+
+
+def test_an_operation_that_onnx_lacks_is_named():
+    program, field = Program(), Field("x", (2,), "i")
+    (result,) = translate(program, lambda x: (x[0] ^ x[1],), [field.given(program)])
+    with pytest.raises(NotTranslatable, match="'xor' of whole numbers"):
+        write_numbers(Graph(), program, [field], [(Field("y", (), "i"), result)])
 
 
 def test_missing_package_is_named_with_the_command_that_installs_it(robot, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from typing import Any, no_type_check
 import numpy as np
 
 from sidestep.bridges.export.exported import Field
-from sidestep.bridges.export.graph import ELEMENTS, Graph
+from sidestep.bridges.export.graph import ELEMENTS, OPSET, Graph
 from sidestep.bridges.export.numbers import CHAINS, Numbers
 from sidestep.bridges.export.packing import Pack, find_packs
 from sidestep.bridges.export.program import Node, NotTranslatable, Program, Stored
@@ -25,7 +25,8 @@ _OPERATORS = {
     "abs": "Abs", "sign": "Sign", "pow": "Pow", "sqrt": "Sqrt", "cos": "Cos", "sin": "Sin", "tan": "Tan",
     "acos": "Acos", "asin": "Asin", "atan": "Atan", "exp": "Exp", "log": "Log", "asinh": "Asinh",
     "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "lt": "Less", "le": "LessOrEqual", "gt": "Greater",
-    "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "xor": "Xor", "not": "Not",
+    "ge": "GreaterOrEqual", "eq": "Equal", "round": "Round", "and": "And", "or": "Or", "xor": "Xor",
+    "not": "Not",
 }  # fmt: skip
 _SEVERAL = {"add": "Sum", "min": "Min", "max": "Max"}
 _REDUCED = {"add": "ReduceSum", "min": "ReduceMin", "max": "ReduceMax", "and": "ReduceMin", "or": "ReduceMax"}
@@ -186,6 +187,8 @@ class _Writer:
             self._placed(operation, first)
             return
         rule = getattr(self, f"_{operation}", None)
+        if first.kind == "i" and operation in ("and", "or", "xor", "not"):
+            raise NotTranslatable(f"there is no {operation!r} of whole numbers in ONNX {OPSET}")
         if operation in CHAINS and len(inputs) > 2:
             tensor = self._chained(operation, first, inputs)
         elif operation in _OPERATORS:
