@@ -33,7 +33,7 @@ def x64() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def need_program() -> Callable[..., str]:
     """`need_program("chromium", package="chromium")`: its path; without it skip here, but fail in CI.
 

@@ -32,10 +32,9 @@ _codes = []
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
+def built(tmp_path_factory, need_program):
     """A cache folder with the library of `game`, and what was kept beside it."""
-    if shutil.which("cc") is None:
-        pytest.skip("there is no C compiler")
+    need_program("cc", package="gcc")
     folder = tmp_path_factory.mktemp("cache") / "sidestep"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(programs, "folder", lambda: folder)
@@ -268,9 +267,8 @@ class Turning(Shield):
         return result, after, (result.barriers[0] > 0.5) | (result.status == Status.INVALID)
 
 
-def test_the_decision_core_decides_the_same_with_and_without_it(tmp_path, monkeypatch):
-    if shutil.which("cc") is None:
-        pytest.skip("there is no C compiler")
+def test_the_decision_core_decides_the_same_with_and_without_it(tmp_path, monkeypatch, need_program):
+    need_program("cc", package="gcc")
     monkeypatch.setattr(programs, "folder", lambda: tmp_path / "sidestep")
     monkeypatch.setattr(checks, "_STATES", 100)
     monkeypatch.setattr(checks, "_FEWEST", 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import Any, no_type_check
 
 import numpy as np
@@ -170,6 +171,15 @@ class Body:
                 found[node.inputs[0].loop].append(node)
         return found
 
+    def _in_order(self, block: Block) -> Iterator[Loop | Node]:
+        """The loops and the numbers of a block that are needed, in the order in which they are computed."""
+        for stage in range(block.stages):
+            yield from (loop for (at, _), loop in block.loops.items() if at == stage)
+            for node in block.nodes:
+                wanted = node.about if node.operation == "store" else node
+                if node.stage == stage and wanted in self.live:
+                    yield node
+
     def _has_one_user(self, node: Node) -> bool:
         """Whether it may be computed where it is used: once, and as often as it would be by itself."""
         users = self.users[node]
@@ -201,14 +211,8 @@ class CBody(Body):
         for array in sorted(self.arrays[block], key=lambda array: (array.stage, array.size)):
             lines.append(f"{TYPES[array.kind]} {self._name(array, 'a')}[{array.size}];")
         reductions = self._reductions(block)
-        for stage in range(block.stages):
-            for (at, _), loop in block.loops.items():
-                if at == stage:
-                    lines += self._loop(loop, reductions[loop])
-            for node in block.nodes:
-                wanted = node.about if node.operation == "store" else node
-                if node.stage == stage and wanted in self.live:
-                    lines += self._statement(node)
+        for one in self._in_order(block):
+            lines += self._loop(one, reductions[one]) if isinstance(one, Loop) else self._statement(one)
         return lines
 
     def _loop(self, loop: Loop, reductions: list[Node]) -> list[str]:

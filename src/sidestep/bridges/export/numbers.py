@@ -57,10 +57,11 @@ class Numbers:
         (index,), (_, results) = node.inputs[0].inputs, node.inputs[0].about
         *before, found = [result[node.about] for result in results]
         for k, one in reversed(list(enumerate(before))):
-            flag = self._new("le", (index, self.program.constant(np.int32(k))), "b")
-            choice = (flag, one, found)
             if index.operation == "to_i" and index.inputs[0].kind == "b":
                 choice = (index.inputs[0], found, one)
+            else:
+                flag = self._new("le", (index, self.program.constant(np.int32(k))), "b")
+                choice = (flag, one, found)
             if k:
                 found = self._new("select", choice, node.kind)
             else:

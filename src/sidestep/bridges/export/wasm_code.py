@@ -236,14 +236,8 @@ class _WasmBody(Body):
             self.top += 4 * array.size
         reductions = self._reductions(block)
         code = bytearray()
-        for stage in range(block.stages):
-            for (at, _), loop in block.loops.items():
-                if at == stage:
-                    code += self._loop(loop, reductions[loop])
-            for node in block.nodes:
-                wanted = node.about if node.operation == "store" else node
-                if node.stage == stage and wanted in self.live:
-                    code += self._statement(node)
+        for one in self._in_order(block):
+            code += self._loop(one, reductions[one]) if isinstance(one, Loop) else self._statement(one)
         return bytes(code)
 
     def _loop(self, loop: Loop, reductions: list[Node]) -> bytes:
