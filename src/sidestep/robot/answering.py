@@ -137,9 +137,7 @@ class Answering:
     def at_once(self, numbers: Array, memory: Any) -> tuple[Array, Any, Any] | None:
         """What `answer` returns where it does not look ahead, for JAX to trace: the vector, whether it need
         not look ahead, and the next memory. None if the shield does not know that beforehand."""
-        world, (given, ask, flee, delay) = self._split(numbers)
-        shield = self.shield.with_delay(delay)
-        nominal = _nominal(shield.scenario, self.policy, world, given, ask, flee)
+        shield, world, nominal = self._asked(self.shield, self.policy, numbers)
         if self.rows_only:
             found = *shield.filter_by_rows(world, nominal, memory), jnp.ones((), bool)
         elif (found := shield.at_once(world, nominal, memory)) is None:
@@ -183,11 +181,15 @@ class Answering:
         return shield.plan(self._split(numbers)[0], memory)
 
     def _answer(self, shield: Shield, policy: Any, numbers: Array, memory: Any) -> Any:
-        world, (given, ask, flee, delay) = self._split(numbers)
-        shield = shield.with_delay(delay)
-        nominal = _nominal(shield.scenario, policy, world, given, ask, flee)
+        shield, world, nominal = self._asked(shield, policy, numbers)
         result, memory = (shield.filter_by_rows if self.rows_only else shield)(world, nominal, memory)
         return _vector(shield.scenario, world, nominal, result), memory
+
+    def _asked(self, shield: Shield, policy: Any, numbers: Array) -> tuple[Shield, World, Array]:
+        """The shield with the delay of this decision, the world, and the nominal velocity (m/s)."""
+        world, (given, ask, flee, delay) = self._split(numbers)
+        shield = shield.with_delay(delay)
+        return shield, world, _nominal(shield.scenario, policy, world, given, ask, flee)
 
     def _split(self, numbers: Array) -> tuple[World, list[Array]]:
         parts = [numbers[cut].reshape(shape) for cut, shape in zip(self._cuts, self.shapes, strict=True)]
