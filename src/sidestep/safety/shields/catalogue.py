@@ -80,7 +80,12 @@ def make_shield(name: str, scenario: Scenario, budget: Budget | None = None) -> 
         if table is not None:
             # A table promises nothing where several obstacles or pursuers matter at once, and after its time.
             # Nor is it exact: straight ahead of a pursuer, beside an obstacle, its set is now and then left.
-            return TableShield(scenario, table, otherwise=JointShield(scenario))
+            shield = TableShield(scenario, table)
+            if table.periods is None:
+                # The look-ahead comes to 0 up to rounding; it keeps what the table keeps.
+                kept = scenario.capture_distance + shield.spare_pursuer
+                scenario = eqx.tree_at(lambda scenario: scenario.capture_distance, scenario, kept)
+            return dataclasses.replace(shield, otherwise=JointShield(scenario))
     if name == "joint:table":
         return TableShield(scenario, table_for(scenario), budget=budget)
     kind: Any = (SHIELDS | JOINT_FORMS)[name]
