@@ -19,6 +19,7 @@ _PUBLIC = {
     "make_shield": "safety",
     "LearnedPolicy": "learning",
     "load_policy": "learning",
+    "load_pursuer": "learning",
     "train": "learning",
     "Evaluation": "trials",
     "Trajectory": "loop",
@@ -40,6 +41,7 @@ __all__ = ["__version__", *_PUBLIC]
 if TYPE_CHECKING:
     from sidestep.learning import LearnedPolicy as LearnedPolicy
     from sidestep.learning import load_policy as load_policy
+    from sidestep.learning import load_pursuer as load_pursuer
     from sidestep.learning import train as train
     from sidestep.loop import Trajectory as Trajectory
     from sidestep.loop import rollout as rollout

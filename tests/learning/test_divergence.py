@@ -94,7 +94,7 @@ def report_of(ended, critic=None, finite=None):
 
     def decision(ended, critic, finite):
         losses = Losses(real(critic), real(0.0), real(0.0))
-        return Report(jnp.asarray(ended), none, tally, none, losses, jnp.asarray(finite))
+        return Report(jnp.asarray(ended), none, tally, jnp.ones(()), none, losses, jnp.asarray(finite))
 
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(decision, ended, critic, finite))
 

@@ -83,7 +83,7 @@ def reward_by_hand(path, steps, lost, target):
 
 def draw(replay, key, **more):
     """A batch and the worlds after it."""
-    batch, _, after = draw_all(replay, key, **more)
+    batch, _, after, _ = draw_all(replay, key, **more)
     return batch, after
 
 
@@ -293,7 +293,7 @@ def test_mirrored_rows_are_the_same_rows_seen_in_a_mirror():
     np.testing.assert_array_equal(mirrored.reward, plain.reward)
     np.testing.assert_array_equal(mirrored.terminated, plain.terminated)
     np.testing.assert_allclose(after_mirror.target, after.target * np.array([1.0, -1.0]), atol=1e-6)
-    half, *half_worlds = draw_all(replay, jax.random.key(4), mirror=0.5)
+    half, *half_worlds, _ = draw_all(replay, jax.random.key(4), mirror=0.5)
     whole, _ = draw(replay, jax.random.key(4))
     flipped = np.any(np.abs(np.asarray(half.observation - whole.observation)) > 1e-6, axis=-1)
     assert flipped.mean() == pytest.approx(0.5, abs=0.06)
@@ -327,7 +327,7 @@ def test_robots_of_ones_own_are_mirrored_with_what_they_keep_or_not_at_all(model
     for world in worlds:
         replay = add(replay, own_transition(world), jnp.asarray(0), jnp.asarray(True))
     numbers = jax.random.key(5), 64, real(0.0)
-    (plain, before, _), (image, mirrored, _) = (
+    (plain, before, _, _), (image, mirrored, _, _) = (
         _draw(scenario, replay, *numbers, real(share), False, real(0.0), real(0.0), real(1.0))
         for share in (0.0, 1.0)
     )

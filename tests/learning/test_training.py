@@ -10,9 +10,11 @@ import pytest
 
 from sidestep._arrays import real
 from sidestep.learning.bounds import on_disc
+from sidestep.learning.players import EVADING
 from sidestep.learning.replay import sample
 from sidestep.learning.td3 import update
-from sidestep.learning.training import _learn, run_chunk, start
+from sidestep.learning.training import Course, _learn, run_chunk, start
+from sidestep.learning.variation import FIXED
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.store.runs import CONVERGENCE_WINDOW
@@ -231,7 +233,7 @@ def test_executed_actions_are_learned_from_through_the_shield_of_their_own_world
             "time_cost": options.time_cost,
             "reward_scale": options.reward_scale,
         }
-        batch, before, after = sample(scenario, replay, sample_key, 16, **settings)
+        batch, before, after, _ = sample(scenario, replay, sample_key, 16, **settings)
 
         def shielded(worlds):
             # A turn of the velocity is the same turn of the action, whatever their axes.
@@ -250,7 +252,8 @@ def test_executed_actions_are_learned_from_through_the_shield_of_their_own_world
     *expected, no_target, wrong_world = by_hand(learner)
     for filtered, wanted in zip((False, True), expected, strict=True):
         chosen = small.options(**asked, filter_gradients=filtered)
-        learn = jax.jit(lambda x, chosen=chosen: _learn(scenario, Turned(), chosen, x, replay, key))
+        course = Course(scenario, Turned(), None, chosen, EVADING, FIXED)
+        learn = jax.jit(lambda x, course=course: _learn(course, course.options, x, replay, key))
         actual = learn(learner)
         leaves = small.leaves_of(actual)
         for name, leaf in small.leaves_of(wanted).items():

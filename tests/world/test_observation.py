@@ -139,7 +139,7 @@ def test_entries_are_what_their_names_say(observation, precision):
 
 @pytest.mark.parametrize("frame", ["target", "world"])
 @pytest.mark.parametrize("pursuers, obstacles", [(1, 0), (1, 1), (3, 8)])
-@pytest.mark.parametrize("motion", ["poses", "motion"])
+@pytest.mark.parametrize("motion", ["poses", "motion", "robots"])
 def test_size_and_names_agree_with_the_observation(frame, pursuers, obstacles, motion):
     scenario = Scenario(pursuer_count=pursuers, obstacle_count=obstacles, frame=frame, observation=motion)
     observation = observe(scenario, random_world(0, pursuers, obstacles))
@@ -199,3 +199,28 @@ def test_evader_sees_what_would_capture_it():
         jnp.zeros(2), jnp.array([[0.5, 0.0, heading]]), jnp.zeros((0, 4)), jnp.array([1.0, 0.0])
     )
     assert np.max(np.abs(see(scenario, make(0.0)) - see(scenario, make(1.5)))) > 0.5
+
+
+def test_robots_and_any_number_of_obstacles_are_seen_in_as_many_entries():
+    """What `motion` sees, five obstacles at most, and the robots' speeds and sizes."""
+    numbers = {"evader_speed": 0.15, "pursuer_speed": 0.3, "pursuer_half_axle": 0.1, "capture_distance": 0.16}
+    numbers |= {"collision_distance": 0.12, "obstacle_velocity": (0.0, 0.03)}
+    expected = [0.75, 1.5, 0.5, 0.8, 0.6, 0.2]
+    for count in (0, 1, 5, 8):
+        world = random_world(count, 1, count)
+        seen = see(Scenario(obstacle_count=count, observation="robots", **numbers), world)
+        plain = see(Scenario(obstacle_count=count, observation="motion", **numbers), world)
+        assert seen.shape == (40,)
+        some = min(len(plain), 34)
+        np.testing.assert_allclose(seen[:some], plain[:some], atol=1e-6)
+        np.testing.assert_array_equal(seen[some:34], 0.0)
+        np.testing.assert_allclose(seen[34:], expected, rtol=1e-5)
+
+
+def test_robots_beyond_ten_metres_are_not_seen():
+    scenario = Scenario(obstacle_count=2, observation="robots")
+    near = random_world(0, 1, 2)
+    far = eqx.tree_at(lambda w: w.obstacles, near, near.obstacles.at[0, 0].set(1000.0))
+    alone = eqx.tree_at(lambda w: w.obstacles, near, near.obstacles[1:])
+    expected = see(Scenario(obstacle_count=1, observation="robots"), alone)
+    np.testing.assert_allclose(see(scenario, far), expected, atol=1e-6)

@@ -37,7 +37,8 @@ class Evaluate:
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Shield: none, paper, game or joint; the run's own, or joint, by default."""
     pursuer: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Pursuer strategy; the run's own, or nash, by default."""
+    """Pursuer strategy, run folder of a trained one, or several joined by +; the run's own, or nash, by
+    default."""
     episodes: int = bounded(1000, EPISODES)
     """Episodes to measure."""
     seed: int = bounded(0, SEED)
@@ -61,6 +62,7 @@ class Evaluate:
 
 def run(command: Evaluate, console: Console) -> int:
     """Run `sidestep evaluate`; returns the exit status."""
+    from sidestep.learning import load_pursuer
     from sidestep.loop import episode_key, rollout
     from sidestep.store.outputs import try_outputs
     from sidestep.trials import take_yardsticks
@@ -80,8 +82,9 @@ def run(command: Evaluate, console: Console) -> int:
         )
     shield = command.shield or config.get("shield", "joint")
     pursuer = command.pursuer or config.get("pursuer", "nash")
+    strategy = load_pursuer(pursuer)
     yardsticks = take_yardsticks(
-        scenario, policy, shield, pursuer, command.episodes, command.seed, planner=command.planner,
+        scenario, policy, shield, strategy, command.episodes, command.seed, planner=command.planner,
         batch=command.batch, count_progress=lambda name: CountBar(console, f"{name}, {shield}, {pursuer}"),
     )  # fmt: skip
     evaluation, compared = yardsticks.evaluation, yardsticks.to_dict()
@@ -92,10 +95,10 @@ def run(command: Evaluate, console: Console) -> int:
     write_json_file(command.json, {**figures, **about, "seed": command.seed})
     if command.log is not None:
         about = {**about, "seed": command.seed, "episode": command.log_episode, "source": "simulation"}
-        _write_log(command, scenario, policy, about, console)
+        _write_log(command, scenario, policy, strategy, about, console)
     if command.film.video is not None:
         number = _chosen(command.video_episode, evaluation)
-        trajectory = rollout(scenario, policy, shield, pursuer, episode_key(command.seed, number))
+        trajectory = rollout(scenario, policy, shield, strategy, episode_key(command.seed, number))
         write_video(command.film, scenario, trajectory, shield, console, f"episode {number}")
     return 0
 
@@ -114,7 +117,7 @@ def _chosen(episode: str, evaluation: Evaluation) -> int:
 
 
 def _write_log(
-    command: Evaluate, scenario: Any, policy: Any, about: dict[str, Any], console: Console
+    command: Evaluate, scenario: Any, policy: Any, strategy: Any, about: dict[str, Any], console: Console
 ) -> None:
     """Replay one of the measured episodes and log it."""
     from sidestep.bridges.logs import save_log
@@ -122,7 +125,7 @@ def _write_log(
 
     assert command.log is not None
     key = episode_key(command.seed, command.log_episode)
-    trajectory = rollout(scenario, policy, about["shield"], about["pursuer"], key)
+    trajectory = rollout(scenario, policy, about["shield"], strategy, key)
     save_log(trajectory, scenario, command.log, about=about)
     console.print(
         f"Log of episode {command.log_episode} ({trajectory.outcome.replace('_', ' ')}): {command.log}",

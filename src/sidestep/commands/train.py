@@ -10,12 +10,15 @@ from sidestep._bounds import EPISODES, SEED, bounded
 from sidestep._program import command as command_line
 from sidestep.commands.common import (
     Overrides,
+    PolicyOption,
     PursuerName,
     ScenarioName,
     ShieldName,
     TrainingBar,
+    given,
     going_on,
     options_from,
+    parse_overrides,
     resume_words,
     say,
     scenario_from,
@@ -31,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a policy with TD3 behind a shield."""
+    """Train a policy with TD3 behind a shield, or a pursuer against a policy."""
 
     out: Path
     """Run folder to write; never overwritten silently."""
@@ -42,7 +45,8 @@ class Train:
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = unless_given("nash")
     """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; mixed,
-    one after another; chauffeur for robots that cannot turn on the spot."""
+    one after another; chauffeur for robots that cannot turn on the spot; the run folder of a trained one; or
+    several joined by +, such as mixed+runs/hunter."""
     episodes: int = bounded(unless_given(200), EPISODES)
     """Training episodes; with --resume the new total, if larger."""
     seed: int = bounded(unless_given(0), SEED)
@@ -53,6 +57,11 @@ class Train:
     """Training options to change, such as discount=0.98 updates_per_decision=3."""
     warm_start: Path | None = None
     """Run folder whose networks the training begins with, such as one behind a cheaper shield."""
+    against: PolicyOption | None = None
+    """Train a pursuer instead, against an evader that drives by this policy behind the shield."""
+    vary: Overrides = ()
+    """Scenario fields that every episode draws anew, such as capture_distance=[0.1,0.2] obstacle_count=[0,5];
+    see the documentation for which."""
     resume: bool = False
     """Resume the run in --out, bit for bit, with its stored settings. Other options must agree with those."""
     json: Path | None = None
@@ -70,8 +79,11 @@ def run(command: Train, console: Console) -> int:
     with going:
         stored = resume_settings(command.out) if command.resume else None
         settings = settings_from(
-            command, "shield", "pursuer", "seed", "episodes", "warm_start", stored=stored
+            command, "shield", "pursuer", "seed", "episodes", "warm_start", "against", stored=stored
         )
+        settings["vary"] = parse_overrides(command.vary) or settings.get("vary")
+        if settings["against"] is not None and given(command, "pursuer"):
+            raise ValueError("--against trains the pursuer itself: leave out --pursuer")
         settings["scenario"] = scenario_from(command, settings.get("scenario"))
         settings["options"] = options_from(command, settings.get("options"))
         with TrainingBar(console, f"training, {settings['shield']}") as show:
@@ -84,10 +96,11 @@ def run(command: Train, console: Console) -> int:
         more = command_line("train", "--out", command.out, "--resume", "--episodes", 2 * settings["episodes"])
         say(console, f"{command.out} had its {settings['episodes']} episodes already. To train on: {more}")
         return 0
-    say(
-        console,
-        f"Policy and summary in {command.out}; next: {command_line('evaluate', command.out)}",
-    )
+    if settings["against"] is None:
+        what, words = "Policy", ["evaluate", command.out]
+    else:
+        what, words = "Pursuer", ["evaluate", settings["against"], "--pursuer", command.out]
+    say(console, f"{what} and summary in {command.out}; next: {command_line(*words)}")
     return 0
 
 

@@ -3,11 +3,13 @@
 from sidestep.learning.divergence import Diverged
 from sidestep.learning.networks import Actor
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
+from sidestep.learning.players import LearnedPursuer
 from sidestep.learning.policy import (
     PRETRAINED,
     PRETRAINED_SCENARIO,
     LearnedPolicy,
     load_policy,
+    load_pursuer,
     policy_file,
     write_policy,
 )
@@ -23,12 +25,14 @@ __all__ = [
     "Batch",
     "Diverged",
     "LearnedPolicy",
+    "LearnedPursuer",
     "Learner",
     "Progress",
     "Training",
     "TrainingOptions",
     "decide_and_learn",
     "load_policy",
+    "load_pursuer",
     "make_options",
     "options_to_dict",
     "policy_file",

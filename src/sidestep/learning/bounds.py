@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arrays import real
 from sidestep.learning.td3 import Bound
+from sidestep.learning.variation import FIXED, Variation
 from sidestep.world import Scenario, World, to_action, to_velocity
 from sidestep.world.robots import limit_speed
 
@@ -18,8 +20,15 @@ def on_disc(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[A
     return jax.vmap(limit_speed, in_axes=(0, None))(actions, real(1.0))
 
 
-def through_shield(scenario: Scenario, shield: Any, worlds: World) -> Bound:
-    """Filter each action with the shield, in its world of `worlds` (leading batch axis).
+def through_shield(
+    scenario: Scenario,
+    shield: Any,
+    worlds: World,
+    variation: Variation = FIXED,
+    drawn: Float[Array, "batch varied"] | None = None,
+) -> Bound:
+    """Filter each action with the shield, in its world of `worlds` (leading batch axis), where the robots are
+    those `drawn`.
 
     The derivative with respect to the action is the identity where the shield accepts the action, the
     projection along a row where the action is projected on that row, and 0 in a corner of two rows, or of a
@@ -29,13 +38,17 @@ def through_shield(scenario: Scenario, shield: Any, worlds: World) -> Bound:
     look-ahead of the shield `joint` is replaced by `shield.rows_only`: it would cost far more than the
     training, and has no derivatives.
     """
-    filtered_by = getattr(shield, "rows_only", shield)
 
-    def filtered(world: World, action: Float[Array, "2"]) -> Float[Array, "2"]:
-        result, _ = filtered_by(world, to_velocity(scenario, world, action), filtered_by.init(world))
-        return to_action(scenario, world, result.action)
+    def filtered(
+        world: World, action: Float[Array, "2"], values: Float[Array, "varied"]
+    ) -> Float[Array, "2"]:
+        mine = variation.scenario(scenario, values)
+        filtered_by = variation.shield(getattr(shield, "rows_only", shield), mine)
+        result, _ = filtered_by(world, to_velocity(mine, world, action), filtered_by.init(world))
+        return to_action(mine, world, result.action)
 
     def bound(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
-        return jax.vmap(filtered)(worlds, actions)
+        values = jnp.zeros((len(actions), 0)) if drawn is None else drawn
+        return jax.vmap(filtered)(worlds, actions, values)
 
     return bound

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 
 from sidestep._arrays import AnyArray, real
 from sidestep.learning.networks import Actor
+from sidestep.learning.players import LearnedPursuer
+from sidestep.pursuit import CHAUFFEURS, MIXTURES, PURSUERS, Mixed, Pursuer, make_pursuer
 from sidestep.store.checkpoints import read_arrays, read_named, write_arrays
 from sidestep.store.runs import RunError, open_run
 
@@ -44,12 +46,13 @@ class LearnedPolicy(eqx.Module):
             )
 
 
-def write_policy(folder: str | Path, policy: LearnedPolicy) -> Path:
-    """Write the policy of a run as `policy.npz`."""
+def write_policy(folder: str | Path, policy: LearnedPolicy | LearnedPursuer) -> Path:
+    """Write the policy of a run, or the pursuer that it has trained, as `policy.npz`."""
     path = Path(folder) / _FILE
     weights = policy.actor.body.weights
     sizes = [int(weights[0].shape[0]), *(int(weight.shape[1]) for weight in weights)]
-    write_arrays(path, policy.actor, sizes=sizes, decision_steps=policy.decision_steps)
+    player: dict[str, Any] = {"player": "pursuer"} if isinstance(policy, LearnedPursuer) else {}
+    write_arrays(path, policy.actor, sizes=sizes, decision_steps=policy.decision_steps, **player)
     return path
 
 
@@ -72,14 +75,56 @@ def policy_file(run: str | Path) -> Path:
     return path
 
 
-def load_policy(run: str | Path) -> LearnedPolicy:
-    """Read the policy of a run folder, of a `policy.npz` file, or `"pretrained"`; see `policy_file`.
-
-    **Raises** as `policy_file`, and `CheckpointError` when the file is damaged.
-    """
+def load_trained(run: str | Path) -> LearnedPolicy | LearnedPursuer:
+    """What a run has trained. **Raises** as `policy_file`, and `CheckpointError` when the file is damaged."""
     path = policy_file(run)
     _, manifest = read_named(path)
     observations, *hidden, actions = manifest["sizes"]
     example = Actor(observations, actions, tuple(hidden), jax.random.key(0))
     actor, manifest = read_arrays(path, example)
-    return LearnedPolicy(actor, int(manifest["decision_steps"]))
+    kind = LearnedPursuer if manifest.get("player") == "pursuer" else LearnedPolicy
+    return kind(actor, int(manifest["decision_steps"]))
+
+
+def load_policy(run: str | Path) -> LearnedPolicy:
+    """Read the policy of a run folder, of a `policy.npz` file, or `"pretrained"`; see `policy_file`.
+
+    **Raises** as `load_trained`, and `RunError` when the run has trained a pursuer.
+    """
+    policy = load_trained(run)
+    if isinstance(policy, LearnedPursuer):
+        raise RunError(f"{run} has trained a pursuer, not a policy for the evader: it goes with --pursuer")
+    return policy
+
+
+def load_pursuer(name: str | Path) -> Pursuer:
+    """The pursuer of that name, of a run folder that has trained one, or a mixture of several.
+
+    **Arguments:** `name` as for `make_pursuer`, or a run folder or its `policy.npz`, or several of these
+    joined by `+`, such as `nash+interceptor+runs/hunter`: one after another, drawn anew every 20 s.
+
+    **Raises** `ValueError` for an unknown name or one that cannot be mixed, and as `load_trained`.
+    """
+    names = str(name).split("+")
+    pursuers = [_pursuer(one) for one in names]
+    if len(pursuers) == 1:
+        return pursuers[0]
+    strategies: list[Pursuer] = []
+    for one, pursuer in zip(names, pursuers, strict=True):
+        strategies += pursuer.strategies if isinstance(pursuer, Mixed) else [pursuer]
+        if not strategies[-1].takes_lanes:
+            raise ValueError(f"pursuer {one} cannot be mixed: it draws random numbers; mixed has its like")
+    return Mixed(tuple(strategies))
+
+
+def _pursuer(name: str) -> Pursuer:
+    known = PURSUERS | CHAUFFEURS | MIXTURES
+    if name in known or not Path(name).exists():
+        try:
+            return make_pursuer(name)
+        except ValueError as error:
+            raise ValueError(f"{error}; nor is there a run folder {name}") from None
+    pursuer = load_trained(name)
+    if isinstance(pursuer, LearnedPolicy):
+        raise RunError(f"{name} has trained a policy for the evader, not a pursuer: train one with --against")
+    return pursuer

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._arrays import Flag, Lanes, Scalar, real
+from sidestep.learning.players import EVADING, Player
 from sidestep.learning.td3 import Batch
-from sidestep.world import EvaderModel, Scenario, World, observe, to_action
+from sidestep.learning.variation import FIXED, Variation
+from sidestep.world import EvaderModel, Scenario, World
 from sidestep.world.robots import closest_approach_straight
 
 
@@ -22,7 +24,8 @@ class Transition(eqx.Module):
     **Attributes:** `path (n+1, 2)` the evader's positions (m) at the control instants, the last one repeated
     after the episode's end; `steps` control periods executed; `proposed (2,)` velocity of the policy and
     `executed (2,)` mean velocity (m/s, world axes); `correction` mean size of the shield's correction (m/s);
-    `lost` whether capture or collision ended it.
+    `lost` whether capture or collision ended it; `drawn`, what was drawn for the episode's robots (see
+    `Variation`). Where a pursuer learns, `proposed` are its wheel speeds (m/s).
     """
 
     world: World
@@ -33,6 +36,7 @@ class Transition(eqx.Module):
     executed: Float[Array, "2 *lanes"]
     correction: Lanes
     lost: Bool[Array, "*lanes"]
+    drawn: Float[Array, "varied *lanes"] = eqx.field(default_factory=lambda: jnp.zeros(0))
 
 
 class Replay(eqx.Module):
@@ -170,17 +174,19 @@ def sample(
     correction_penalty: Float[Array, ""],
     time_cost: Float[Array, ""],
     reward_scale: Float[Array, ""],
-) -> tuple[Batch, World, World]:
+    player: Player = EVADING,
+    variation: Variation = FIXED,
+) -> tuple[Batch, World, World, Float[Array, "batch varied"]]:
     """A batch of uniformly sampled transitions, a share `hindsight` of them with a position reached later as
     target.
 
     The later position is uniform over the rest of the same episode (the "future" strategy). The action is the
     proposed or the executed velocity in the policy's axes *for that target*. The reward is `reward_scale`
     times the sum (less the `time_cost`, see `reward_along`) less `correction_penalty` times the mean
-    correction (as a share of v_e).
+    correction (as a share of v_e), all of it as the `player` sees it.
 
-    **Returns** the batch, and the worlds before and after its actions, with the sampled targets and mirrored
-    like the batch, so that a shield can be evaluated in them.
+    **Returns** the batch, the worlds before and after its actions, with the sampled targets and mirrored
+    like the batch, so that a shield can be evaluated in them, and what was drawn for their robots.
     """
     index_key, later_key, choice_key, knot_key, mirror_key = jax.random.split(key, 5)
     # Slots count back from the newest, so that sampling is uniform over the stored transitions.
@@ -206,14 +212,18 @@ def sample(
     def with_target(world: World) -> World:
         return eqx.tree_at(lambda w: w.target, world, target)
 
-    reward, terminated = jax.vmap(reward_along, in_axes=(None, 0, 0, None))(
-        scenario, picked, target, time_cost
-    )
+    def rewarded(transition: Transition, target: Float[Array, "2"]) -> tuple[Scalar, Bool[Array, ""]]:
+        mine = variation.scenario(scenario, transition.drawn)
+        reward, terminated = reward_along(mine, transition, target, time_cost)
+        reward -= correction_penalty * transition.correction / mine.evader_speed
+        return player.reward(mine, reward, transition.lost.astype(reward.dtype)), terminated
+
+    reward, terminated = jax.vmap(rewarded)(picked, target)
     model = scenario.evader_model
     share = mirror if _has_mirror_images(model, picked.world.evader_state) else 0.0
     flip = jax.random.uniform(mirror_key, (batch_size,), dtype=float) < share
-    velocity = picked.executed if executed_action else picked.proposed
-    velocity = jnp.where(flip[:, None], _reflect(velocity), velocity)
+    command = picked.executed if executed_action else picked.proposed
+    command = jnp.where(flip[:, None], player.mirrored(command), command)
     world, next_world = (
         jax.tree.map(
             lambda mirrored, seen: jnp.where(jnp.expand_dims(flip, range(1, seen.ndim)), mirrored, seen),
@@ -222,12 +232,19 @@ def sample(
         )
         for world in (with_target(picked.world), with_target(picked.next_world))
     )
-    penalty = correction_penalty * picked.correction / scenario.evader_speed
+
+    def seen(world: World, drawn: Float[Array, "varied"]) -> Float[Array, "observation"]:
+        return player.observe(variation.scenario(scenario, drawn), world)
+
+    def acted(world: World, command: Float[Array, "2"], drawn: Float[Array, "varied"]) -> Float[Array, "2"]:
+        return player.action(variation.scenario(scenario, drawn), world, command)
+
+    drawn = picked.drawn
     batch = Batch(
-        observation=jax.vmap(observe, in_axes=(None, 0))(scenario, world),
-        action=jax.vmap(to_action, in_axes=(None, 0, 0))(scenario, world, velocity),
-        reward=reward_scale * (reward - penalty),
-        next_observation=jax.vmap(observe, in_axes=(None, 0))(scenario, next_world),
+        observation=jax.vmap(seen)(world, drawn),
+        action=jax.vmap(acted)(world, command, drawn),
+        reward=reward_scale * reward,
+        next_observation=jax.vmap(seen)(next_world, drawn),
         terminated=terminated.astype(reward.dtype),
     )
-    return batch, world, next_world
+    return batch, world, next_world, drawn

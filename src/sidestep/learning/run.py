@@ -20,23 +20,24 @@ from sidestep._version import __version__
 from sidestep.learning.curves import Curves
 from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
-from sidestep.learning.policy import LearnedPolicy, load_policy, write_policy
+from sidestep.learning.players import EVADING, LearnedPursuer, Player, Pursuing
+from sidestep.learning.policy import LearnedPolicy, load_policy, load_pursuer, load_trained, write_policy
 from sidestep.learning.td3 import Learner
 from sidestep.learning.training import Report, TrainState, run_chunk, start
-from sidestep.loop.episode import straight_times
+from sidestep.learning.variation import Variation
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.store import runs as records
 from sidestep.store.checkpoints import list_checkpoints, read_checkpoint, read_part, write_checkpoint
 from sidestep.store.files import OutputError, json_safe, write_json
-from sidestep.world import Scenario, load_scenario, observation_size, scenario_to_dict
+from sidestep.world import Scenario, load_scenario, scenario_to_dict
 
 CHUNK, CHUNK_OF_MANY = 100, 20
 """Decisions per compiled call, of one world and of each of many: some 0.5 s, so that progress and Ctrl-C
 respond quickly."""
 
 
-_SETTINGS = ("scenario", "learner", "shield", "pursuer", "seed", "warm_start")
+_SETTINGS = ("scenario", "learner", "shield", "pursuer", "seed", "warm_start", "against", "vary")
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,12 @@ class Progress:
 
 @dataclass(frozen=True)
 class Training:
-    """The result of a training: policy, `summary.json`, one entry per episode, and the final state.
+    """The result of a training: policy (or pursuer), `summary.json`, one entry per episode, the final state.
 
     `had_ended`: the training was resumed but had already ended.
     """
 
-    policy: LearnedPolicy
+    policy: LearnedPolicy | LearnedPursuer
     summary: dict[str, Any]
     metrics: list[dict[str, Any]]
     state: TrainState
@@ -86,7 +87,8 @@ def _episode_lines(scenario: Scenario, report: Report, done: int) -> list[dict[s
     """The lines of `metrics.jsonl` for the episodes that ended in a chunk."""
     ended = np.nonzero(np.asarray(report.ended))
     tally = jax.tree.map(lambda leaf: np.asarray(leaf)[ended], report.tally)
-    straight = straight_times(scenario, tally.distance)
+    way = np.maximum(tally.distance - np.asarray(scenario.reach_distance), 0.0)
+    straight = way / np.asarray(report.evader_speed)[ended]
     outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended[0]]
     return [
         json_safe(
@@ -125,7 +127,7 @@ def resume_settings(folder: str | Path) -> dict[str, Any]:
         "seed": config["seed"],
         "episodes": config["episodes"],
         "options": make_options(**config["learner"]),
-        "warm_start": config.get("warm_start"),
+        **{name: config.get(name) for name in ("warm_start", "against", "vary")},
     }
 
 
@@ -144,20 +146,28 @@ def train(
     checkpoint_seconds: float = 20.0,
     chunk: int | None = None,
     warm_start: str | Path | None = None,
+    against: str | Path | None = None,
+    vary: Mapping[str, Any] | None = None,
 ) -> Training:
-    """Train a policy with TD3 behind a shield.
+    """Train a policy with TD3 behind a shield, or a pursuer against such a policy.
 
     With `out` the run is a folder: `config.json`, `metrics.jsonl`, checkpoints, TensorBoard curves, and at
     the end `summary.json` and `policy.npz`. The same seed gives the same run on the same machine, with or
     without interruption and resume. `KeyboardInterrupt` stops the training after the current chunk and writes
     a checkpoint.
 
-    **Arguments:** `shield` and `pursuer` names or objects; `resume` continues the run in `out`, with the
-    stored scenario, shield, pursuer, seed and options (`resume_settings` reads them), while `episodes` may be
-    larger; `progress` is called after every chunk of `chunk` decisions (by default what takes some 0.5 s).
+    **Arguments:** `shield` and `pursuer` names or objects, for a pursuer also names as `load_pursuer` takes
+    them; `resume` continues the run in `out`, with the stored scenario, shield, pursuer, seed and options
+    (`resume_settings` reads them), while `episodes` may be larger; `progress` is called after every chunk of
+    `chunk` decisions (by default what takes some 0.5 s).
 
     With `warm_start`, another run's folder, the learner begins with the networks and moments of its newest
     checkpoint and an empty replay: for another shield, pursuer or scenario with equal observations.
+
+    With `against`, a run folder, `pretrained` or `goal-seeking`, the pursuer learns, and the evader drives by
+    that policy behind the shield (see `Pursuing`); `pursuer` has no effect then. With `vary`, such as
+    `{"capture_distance": [0.1, 0.2], "obstacle_count": [0, 5]}`, every episode draws its own robots (see
+    `Variation`).
 
     The folder is locked until the last file is written. A run that has all its episodes is not changed. A
     damaged checkpoint is skipped with a `DamageWarning`.
@@ -171,11 +181,20 @@ def train(
     whole_number("episodes", episodes)
     seed_number(seed)
     options = make_options() if options is None else options
+    player: Player = EVADING
+    if against is not None:
+        against, pursuer, options = str(against), "learned", Pursuing.options(options)
+        player = Pursuing.against(against if against == "goal-seeking" else load_policy(against), scenario)
     if chunk is None:
         chunk = CHUNK if options.worlds == 1 else CHUNK_OF_MANY
     whole_number("chunk", chunk)
     names = {"shield": _name(shield), "pursuer": _name(pursuer)}
-    shield, pursuer = as_shield(shield, scenario), as_pursuer(pursuer)
+    shield = as_shield(shield, scenario)
+    variation, scenario, shield = Variation.of(vary or {}, scenario, shield)
+    if player is not EVADING:
+        pursuer = None
+    else:
+        pursuer = load_pursuer(pursuer) if isinstance(pursuer, str) else as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)
     config = {
         "scenario": scenario_to_dict(scenario),
@@ -185,12 +204,16 @@ def train(
         "episodes": int(episodes),
         "version": __version__,
     }
+    if against is not None:
+        config["against"] = against
+    if vary:
+        config["vary"] = {name: list(ends) for name, ends in vary.items()}
     folder, learner = None if out is None else Path(out), None
     if warm_start is not None:
         config["warm_start"] = str(Path(warm_start).absolute())
         if not (resume and folder is not None and list_checkpoints(folder)):
-            learner = _learner_of(warm_start, scenario, options)
-    setup = _Setup(scenario, shield, pursuer, options, capacity, learner)
+            learner = _learner_of(warm_start, player.observation_size(scenario), options)
+    setup = _Setup(scenario, shield, pursuer, options, capacity, learner, player, variation)
     with nullcontext() if folder is None else records.writing(folder, resume=resume):
         return _run(setup, config, folder, resume, progress, checkpoint_seconds, chunk)
 
@@ -204,12 +227,14 @@ class _Setup(NamedTuple):
     options: TrainingOptions
     capacity: int
     learner: Learner | None
+    player: Player
+    variation: Variation
 
 
-def _learner_of(run: str | Path, scenario: Scenario, options: TrainingOptions) -> Learner:
+def _learner_of(run: str | Path, observations: int, options: TrainingOptions) -> Learner:
     """The learner of another training. **Raises** `RunError` if it does not fit."""
     records.open_run(run, otherwise="name the run folder of a training")
-    example = options.algorithm.init(observation_size(scenario), 2, jax.random.key(0))
+    example = options.algorithm.init(observations, 2, jax.random.key(0))
     return read_part(run, "learner", example)
 
 
@@ -223,13 +248,13 @@ def _run(
     chunk: int,
 ) -> Training:
     """The training, with its folder locked."""
-    scenario, shield, pursuer, options, capacity, learner = setup
+    scenario, shield, pursuer, options, capacity, learner, player, variation = setup
     episodes = int(config["episodes"])
     if folder is not None and resume:
         _check_same_run(folder, config)
     elif folder is not None:
         records.create_run(folder, config)
-    state = start(scenario, shield, options, jax.random.key(config["seed"]), capacity)
+    state = start(scenario, shield, options, jax.random.key(config["seed"]), capacity, player, variation)
     if learner is not None:
         state = eqx.tree_at(lambda state: state.learner, state, learner)
     metrics: list[dict[str, Any]] = []
@@ -259,7 +284,9 @@ def _run(
         while int(state.ended) < episodes:
             _interrupts.check()
             chunk_begun, steps_before = time.perf_counter(), int(state.env_steps)
-            reached, report = run_chunk(scenario, shield, pursuer, options, state, limit, chunk)
+            reached, report = run_chunk(
+                scenario, shield, pursuer, options, state, limit, chunk, player, variation
+            )
             diverged = divergence(report, reached.learner, len(metrics))
             if diverged is not None:
                 break
@@ -291,7 +318,8 @@ def _run(
         raise
     figures, checkpoint = summary(), None
 
-    policy = LearnedPolicy(state.learner.actor, options.decision_steps)
+    kind = LearnedPolicy if player is EVADING else LearnedPursuer
+    policy = kind(state.learner.actor, options.decision_steps)
     if folder is not None:
         try:
             checkpoint = _keep(folder, metrics, state, earlier + time.perf_counter() - begun, figures)
@@ -354,7 +382,7 @@ def _ended_before(
 ) -> Training | None:
     """The result of a run that has all its episodes and files; None if anything is left to do."""
     try:
-        policy, summary = load_policy(folder), records.read_summary(folder)
+        policy, summary = load_trained(folder), records.read_summary(folder)
     except records.RunError:
         return None
     if int(state.ended) < episodes or summary.get("episodes", 0) < episodes:

@@ -88,7 +88,8 @@ class Losses(eqx.Module):
     value: Scalar
 
 
-def _no_bound(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
+def no_bound(actions: Float[Array, "batch action"], key: PRNGKeyArray) -> Float[Array, "batch action"]:
+    """Every action is possible."""
     return actions
 
 
@@ -112,7 +113,7 @@ def update(
     learner: Learner,
     batch: Batch,
     key: PRNGKeyArray,
-    bound: Bound = _no_bound,
+    bound: Bound = no_bound,
     target_bound: Bound | None = None,
     value_limit: Scalar | None = None,
 ) -> tuple[Learner, Losses]:

@@ -9,8 +9,13 @@ are the world's. Entries are scaled to about [-1, 1]; "squashed" means p/(1 + |p
 | 2 | tanh(d/2), exp(-d/0.25): far and near view of the distance d to the target (m) |
 | 2 | direction of the target (cos, sin); only with `frame="world"` |
 | 5 per pursuer | position squashed (2), heading (cos, sin), exp(-c/0.2) for its clearance c (m) |
-| 2 more per pursuer | wheel speeds (left, right) of the last period / V; only with `observation="motion"` |
+| 2 more per pursuer | wheel speeds (left, right) of the last period / V; not with `observation="poses"` |
 | 5 per obstacle | position squashed (2), velocity / v_e (2), exp(-c/0.2) for its clearance c (m) |
+| 6 | v_e, V (in 0.2 m/s), b, l, d_oc (in 0.2 m), obstacle speed / v_e; only with `observation="robots"` |
+
+With `observation="robots"` there are entries for five obstacles, the nearest ones, whatever the scenario's
+number; those of obstacles that it lacks, or that are more than 10 m away, are 0. So one policy serves many
+robots.
 
 Pursuers and obstacles are sorted, nearest first, so their order in the world has no effect. The policy's
 action is in [-1, 1]^2 in the same axes; the velocity is v_e times the action, its norm clipped to 1.
@@ -29,11 +34,15 @@ from sidestep.world.state import World
 
 FAR_TARGET, NEAR_TARGET, NEAR_ROBOT = 2.0, 0.25, 0.2
 """Scales (m) of the far and near view of the target, and of clearances."""
+_SLOTS, _SEEN = 5, 10.0
+"""Obstacles that are seen with `observation="robots"`, and from how near (m)."""
+_SPEED, _SIZE = 0.2, 0.2
+"""Scales of the robots' speeds (m/s) and sizes (m)."""
 
 
 def observation_size(scenario: Scenario) -> int:
-    """Number of entries of `observe`: 2 (4 with `frame="world"`) + 5 m (7 m with `observation="motion"`) + 5
-    k."""
+    """Number of entries of `observe`: 2 (4 with `frame="world"`) + 5 m + 5 k; 2 + 7 m + 5 k with
+    `observation="motion"`; 2 + 7 m + 31 with `"robots"`."""
     return len(observation_names(scenario))
 
 
@@ -44,10 +53,16 @@ def observation_names(scenario: Scenario) -> list[str]:
         names += ["target_cos", "target_sin"]
     for i in range(scenario.pursuer_count):
         names += [f"pursuer{i}_{part}" for part in ("x", "y", "cos", "sin", "near")]
-        if scenario.observation == "motion":
+        if scenario.observation != "poses":
             names += [f"pursuer{i}_{wheel}" for wheel in ("left", "right")]
-    for i in range(scenario.obstacle_count):
+    robots = scenario.observation == "robots"
+    for i in range(_SLOTS if robots else scenario.obstacle_count):
         names += [f"obstacle{i}_{part}" for part in ("x", "y", "vx", "vy", "near")]
+    if robots:
+        names += [
+            "evader_speed", "pursuer_speed", "pursuer_half_axle", "capture_distance", "collision_distance",
+            "obstacle_speed",
+        ]  # fmt: skip
     return names
 
 
@@ -114,11 +129,34 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
         return [jnp.clip(wheel / scenario.pursuer_speed, -1.0, 1.0) for wheel in robot[3:]]
 
     pursuers = world.pursuers
-    if scenario.observation == "motion":
+    if scenario.observation != "poses":
         pursuers = jnp.concatenate([pursuers, world.wheel_speeds], axis=1)
     entries += block(pursuers, heading, scenario.capture_distance, wheels)
-    entries += block(world.obstacles, drift, scenario.collision_distance)
-    return stack(*entries)
+    obstacles = block(world.obstacles, drift, scenario.collision_distance)
+    if scenario.observation == "robots":
+        # Sorted, nearest first, of five entries each.
+        seen = jnp.sort(_distances(world), axis=0) < _SEEN
+        shown = [jnp.where(seen[i // 5], entry, 0.0) for i, entry in enumerate(obstacles[: 5 * _SLOTS])]
+        obstacles = shown + [jnp.zeros_like(distance)] * (5 * _SLOTS - len(shown)) + _robots(scenario)
+    return stack(*entries, *obstacles)
+
+
+def _distances(world: World) -> Float[Array, "k *lanes"]:
+    """From the evader to each obstacle, m."""
+    return length(world.obstacles[:, 0] - world.evader[0], world.obstacles[:, 1] - world.evader[1])
+
+
+def _robots(scenario: Scenario) -> list[Scalar]:
+    """The robots' speeds and sizes, scaled."""
+    drift = length(scenario.obstacle_velocity[0], scenario.obstacle_velocity[1])
+    return [
+        scenario.evader_speed / _SPEED,
+        scenario.pursuer_speed / _SPEED,
+        scenario.pursuer_half_axle / _SIZE,
+        scenario.capture_distance / _SIZE,
+        scenario.collision_distance / _SIZE,
+        drift / scenario.evader_speed,
+    ]
 
 
 def to_velocity(

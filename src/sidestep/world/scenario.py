@@ -67,8 +67,9 @@ class Scenario(eqx.Module):
     **Counts and modes** `pursuer_count`, `obstacle_count`, `episode_steps` (control periods),
     `obstacle_motion` = `"steady"` or `"adversarial"`: obstacles then head for where the evader will be at the
     end of each period; `action` = `"velocity"` (disc |u| <= v_e) or `"heading"` (circle |u| = v_e), `frame` =
-    `"target"` or `"world"` (axes of observation and policy action), `observation` = `"poses"` or `"motion"`
-    (the pursuers' wheel speeds too).
+    `"target"` or `"world"` (axes of observation and policy action), `observation` = `"poses"`, `"motion"`
+    (the pursuers' wheel speeds too), or `"robots"` (these, the robots' speeds and sizes, and any number of
+    obstacles).
 
     **Custom robots** `evader_model`, `pursuer_model`, see `EvaderModel` and `PursuerModel`; None for the
     omnidirectional evader and the differential drive. They are code, and so not in files.
@@ -106,7 +107,7 @@ class Scenario(eqx.Module):
     obstacle_directions: str = static_field("fixed", one_of("fixed", "random"))
     obstacle_motion: str = static_field("steady", one_of("steady", "adversarial"))
     frame: str = static_field("target", one_of("target", "world"))
-    observation: str = static_field("poses", one_of("poses", "motion"))
+    observation: str = static_field("poses", one_of("poses", "motion", "robots"))
 
     @property
     def usable_angle(self) -> Scalar:
