@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sidestep.learning import load_pursuer
 from sidestep.pursuit import Pursuer, make_pursuer
 from sidestep.pursuit.steering import bearing_of, nearer_end, turn_and_drive
 from sidestep.trials.falsification.attackers import JointSaddle, herder, sideswiper
@@ -91,5 +92,5 @@ period allows, and knows the evader's velocity."""
 
 
 def pursuer_named(name: str) -> Any:
-    """An attacking pursuer, or one of `make_pursuer`."""
-    return ATTACKS[name]() if name in ATTACKS else make_pursuer(name)
+    """An attacking pursuer, or one of `load_pursuer`."""
+    return ATTACKS[name]() if name in ATTACKS else load_pursuer(name)

@@ -6,8 +6,9 @@ The scenes are crowded: all within a square of 1.6 m, obstacles drifting at the 
 directions or (`--adversarial`) towards the evader, their centres at the start at least as far apart as is
 needed for one at a time to matter. A tenth of the starts lie within 5 mm of the set's boundary. The evader
 drives at its target and stays there, so that every chase lasts `--seconds`. Pursuers: every built-in
-strategy, herders, sideswipers, random switching, and two that know the velocity chosen: the table's own worst
-case (`joint-saddle`) and the same two steps deep. Counted are captures and collisions; a chase is lost once.
+strategy, herders, sideswipers, the trained `hunter`, random switching, and two that know the velocity chosen:
+the table's own worst case (`joint-saddle`) and the same two steps deep. Counted are captures and collisions;
+a chase is lost once.
 `--shield` takes another one, and `--closer` obstacles or a `--faster` drift than the table was solved for: it
 must then be lost now and then, or the attacks are too weak to say anything.
 """
@@ -25,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sidestep
+from sidestep.learning import load_pursuer
 from sidestep.safety import make_shield
 from sidestep.safety.clearance import shipped_table
 from sidestep.safety.shields import TableShield
@@ -40,7 +42,7 @@ from sidestep.trials.falsification.attackers import (
 )
 from sidestep.trials.falsification.chases import Target, run_from
 
-NAMES = ("built-in", "herder", "sideswipe", "bang-bang", "joint-saddle", "two-step")
+NAMES = ("built-in", "herder", "sideswipe", "hunter", "bang-bang", "joint-saddle", "two-step")
 LIMIT = {"two-step": 20}
 """Share of the chases that slow attacks get: one in so many."""
 
@@ -140,6 +142,9 @@ def pursuers(name: str, table: Any, scenario: Any, count: int, periods: int, key
             jax.random.uniform(first, (count,), dtype=float, minval=0.1, maxval=1.2),
             jax.random.uniform(second, (count,), dtype=float, minval=-1.3, maxval=1.3),
         )
+    if name == "hunter":
+        hunter = load_pursuer(name)
+        return (lambda _: hunter), jnp.zeros(count)
     if name == "bang-bang":
         plans = eqx.filter_jit(jax.vmap(lambda key: bang_bang(scenario, key, periods, jnp.asarray(40.0))))
         return script, (plans(jax.random.split(first, count)), jnp.zeros(count, jnp.int32))

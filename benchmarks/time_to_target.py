@@ -4,8 +4,10 @@
     python benchmarks/time_to_target.py runs/mine --shield game --pursuers nash interceptor --out mine.json
 
 What is compared, and how, is what `sidestep evaluate RUN` prints (`sidestep.trials.yardsticks`), here for
-many pursuers. `straight` is the time straight there at full speed, which nobody can beat. No training meets
-the `chauffeur` and the falsifier's `herder` and `sideswiper`. An interrupted study goes on where it stopped.
+many pursuers; trained ones go by their run folders. `straight` is the time straight there at full speed,
+which nobody can beat. The training of `pretrained` meets none of the last four: the `chauffeur`, the
+falsifier's `herder` and `sideswiper`, and the `hunter`, which has learned against it. An interrupted study
+goes on where it stopped.
 """
 
 import argparse
@@ -26,7 +28,7 @@ from sidestep.trials import take_yardsticks
 from sidestep.trials.falsification.attackers import herder
 from sidestep.trials.yardsticks import time_figures
 
-HELD_OUT = ("chauffeur", "herder", "sideswiper")
+HELD_OUT = ("chauffeur", "herder", "sideswiper", "hunter")
 LIMIT = 120.0
 
 

@@ -5,6 +5,7 @@ from sidestep.learning.networks import Actor
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.players import LearnedPursuer
 from sidestep.learning.policy import (
+    HUNTER,
     PRETRAINED,
     PRETRAINED_SCENARIO,
     LearnedPolicy,
@@ -18,6 +19,7 @@ from sidestep.learning.td3 import TD3, Batch, Learner, update
 from sidestep.learning.training import decide_and_learn, run_chunk, start
 
 __all__ = [
+    "HUNTER",
     "PRETRAINED",
     "PRETRAINED_SCENARIO",
     "TD3",

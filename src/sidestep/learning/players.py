@@ -227,7 +227,7 @@ class _Held(Pursuer):
         return self.wheels
 
 
-_OWN, _EACH = 9, 3
+_OWN, _EACH = 7, 3
 """Entries of a pursuer's observation, and of each obstacle."""
 
 
@@ -235,9 +235,10 @@ def pursuers_view(scenario: Scenario, world: World) -> Float[Array, "observation
     """The observation of a pursuer that learns, in its own axes: x ahead, y left.
 
     - 3 of the evader: position squashed, p/(1 + |p|), and exp(-c/0.2) for its clearance c (m)
-    - 2 the evader's velocity in the last period / v_e; 2 its target's position squashed
-    - 2 its own wheel speeds in the last period / V
+    - 2 the evader's velocity in the last period / v_e; 2 its own wheel speeds in the last period / V
     - 3 per obstacle: position squashed, and exp(-c/0.2) for the evader's clearance c (m)
+
+    It does not see the target. One that did learned to wait there, where no evader can do anything about it.
     """
     pose = world.pursuer
 
@@ -256,7 +257,6 @@ def pursuers_view(scenario: Scenario, world: World) -> Float[Array, "observation
         *squashed(world.evader),
         near(pose, scenario.capture_distance),
         *velocity,
-        *squashed(world.target),
         *wheels,
     ]
     for obstacle in world.obstacles:

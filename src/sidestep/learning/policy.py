@@ -19,7 +19,9 @@ from sidestep.store.runs import RunError, open_run
 _FILE = "policy.npz"
 PRETRAINED = "pretrained"
 """The name of the policy that comes with the package, for preset `paper` with `observation="motion"`."""
-_SHIPPED = Path(__file__).with_name("pretrained.npz")
+HUNTER = "hunter"
+"""The name of the pursuer that comes with the package, for scenarios with one obstacle: it learned against
+`pretrained`."""
 PRETRAINED_SCENARIO = {"observation": "motion"}
 """The fields of preset `paper` that were changed for its training."""
 
@@ -59,13 +61,13 @@ def write_policy(folder: str | Path, policy: LearnedPolicy | LearnedPursuer) -> 
 def policy_file(run: str | Path) -> Path:
     """The file of a policy.
 
-    **Arguments:** `run`, a run folder, a `policy.npz` file, or `"pretrained"` for the policy that comes with
-    the package; a folder of that name is `./pretrained`.
+    **Arguments:** `run`, a run folder, a `policy.npz` file, or `"pretrained"` or `"hunter"` for the policy
+    and the pursuer that come with the package; a folder of that name is `./pretrained`.
 
     **Raises** `RunError` when the folder holds no run or its training has not ended.
     """
-    if run == PRETRAINED:
-        return _SHIPPED
+    if run in (PRETRAINED, HUNTER):
+        return Path(__file__).with_name(f"{run}.npz")
     path = Path(run)
     if path.suffix != ".npz":
         open_run(path, otherwise="name a run folder, or the policy.npz in it")
@@ -100,8 +102,9 @@ def load_policy(run: str | Path) -> LearnedPolicy:
 def load_pursuer(name: str | Path) -> Pursuer:
     """The pursuer of that name, of a run folder that has trained one, or a mixture of several.
 
-    **Arguments:** `name` as for `make_pursuer`, or a run folder or its `policy.npz`, or several of these
-    joined by `+`, such as `nash+interceptor+runs/hunter`: one after another, drawn anew every 20 s.
+    **Arguments:** `name` as for `make_pursuer`, or `hunter`, the one that comes with the package, or a run
+    folder or its `policy.npz`, or several of these joined by `+`, such as `nash+interceptor+runs/mine`: one
+    after another, drawn anew every 20 s.
 
     **Raises** `ValueError` for an unknown name or one that cannot be mixed, and as `load_trained`.
     """
@@ -119,11 +122,11 @@ def load_pursuer(name: str | Path) -> Pursuer:
 
 def _pursuer(name: str) -> Pursuer:
     known = PURSUERS | CHAUFFEURS | MIXTURES
-    if name in known or not Path(name).exists():
+    if name != HUNTER and (name in known or not Path(name).exists()):
         try:
             return make_pursuer(name)
         except ValueError as error:
-            raise ValueError(f"{error}; nor is there a run folder {name}") from None
+            raise ValueError(f"{error}, {HUNTER}; nor is there a run folder {name}") from None
     pursuer = load_trained(name)
     if isinstance(pursuer, LearnedPolicy):
         raise RunError(f"{name} has trained a policy for the evader, not a pursuer: train one with --against")
