@@ -18,6 +18,9 @@ TORCH ?= torch==2.13.0
 JOBS ?= 2
 PAGES ?= README.md docs ros2/sidestep_ros/README.md
 ARGS ?=
+# Compiling is mostly small allocations: where Debian's libjemalloc2 is installed, tests compile in two thirds of the time.
+ALLOCATOR ?= $(firstword $(wildcard /usr/lib/*-linux-gnu/libjemalloc.so.2))
+PYTEST = LD_PRELOAD=$(ALLOCATOR) $(PY) -m pytest -q -n $(JOBS)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup reproduce play test test-all test-ros test-pages test-wheel check format wheel lock lock-ros docs bench clean
@@ -63,11 +66,11 @@ play: $(READY) ## Serve the page in which you try to catch the robot
 	$(VENV)/bin/sidestep play $(ARGS)
 
 test: $(READY_DEV) ## Run the tests (those marked slow: make test ARGS='-m slow')
-	$(PY) -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not slow and not wheel" $(ARGS)
+	$(PYTEST) --dist loadfile --no-loadscope-reorder -m "not slow and not wheel" $(ARGS)
 
 # An empty XLA_FLAGS leaves the compiler's level as users have it; conftest.py lowers it otherwise.
 test-all: $(READY_DEV) ## Run every test, those marked slow too, compiled as users have it (an hour on two cores)
-	XLA_FLAGS= $(PY) -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not wheel" $(ARGS)
+	XLA_FLAGS= $(PYTEST) --dist loadfile --no-loadscope-reorder -m "not wheel" $(ARGS)
 
 test-ros: $(ROS_READY) ## Types and tests of the ROS 2 package, with real ROS 2 nodes (Linux on x86-64, Python 3.11 to 3.13)
 	$(PY) -m pyright -p ros2
@@ -75,7 +78,7 @@ test-ros: $(ROS_READY) ## Types and tests of the ROS 2 package, with real ROS 2 
 	  ros2/sidestep_ros/test $(ARGS)
 
 test-pages: $(READY_DEV) ## Run the code blocks of README and docs (some of them: make test-pages PAGES=docs/own.md)
-	$(PY) -m pytest -q -n $(JOBS) --dist loadfile $(PAGES) $(ARGS)
+	$(PYTEST) --dist loadfile $(PAGES) $(ARGS)
 
 test-wheel: $(READY_DEV) ## Build the wheel and install it with each extra, outside the clone (needs a package index)
 	$(PY) -m pytest -q -n $(JOBS) -m wheel $(ARGS)

@@ -39,6 +39,11 @@ os.environ.setdefault(
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1",
 )
+# Compiling is mostly small allocations. glibc's malloc reads this when a worker or a child of one starts.
+# What the Makefile preloads is better, but no sanitizer starts behind it.
+os.environ.setdefault("GLIBC_TUNABLES", "glibc.malloc.tcache_count=65535")
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.pop("LD_PRELOAD", None)
 # Tracing makes millions of objects that stay, and by default a fifth of the run looks for garbage in them.
 gc.set_threshold(200_000, 20, 100)
 # What one process compiles, the other test processes and their children load: this one starts them all.
