@@ -52,6 +52,12 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
+# What `runs` makes, for all test processes.
+SHARED = "SIDESTEP_PAGES_SHARED"
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ[SHARED] = tempfile.mkdtemp(prefix="pages-")
+    atexit.register(shutil.rmtree, os.environ[SHARED], ignore_errors=True)
+
 ROOT = Path(__file__).parent
 
 OTHER_MACHINES = "needs other machines: a scheduler, SSH hosts or a cluster"
@@ -278,39 +284,41 @@ def make_clone(folder: Path) -> None:
         (home / stamp).touch()
 
 
-_runs: list[Path] = []
-
-
 def runs() -> Path:
     """A folder with what the pages take to be there already, made once by the commands they name."""
-    if not _runs:
-        folder = Path(tempfile.mkdtemp(prefix="pages-"))
-        for words in (
-            "train --out runs/mine",
-            "reproduce --out runs/reproduce",
-        ):
-            text = io.StringIO()
-            with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
-                assert sidestep(words.split(), folder) == 0, text.getvalue()
-        with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text), contextlib.chdir(folder):
-            from sidestep.cli import main
+    from filelock import FileLock
 
-            search = "falsify --shield none --attacks edge --episodes 16 --batch 16 --seconds 20 --out found"
-            assert main(search.split()) == 0, text.getvalue()
-        for name in ("first", "none", "game-seed-0", "game-seed-1"):
-            shutil.copytree(folder / "runs/mine", folder / "runs" / name)
-        found = sorted((folder / "found/counterexamples").glob("*.npz"))[0]
-        found.rename(folder / "found.npz")
-        worst = sorted((folder / "runs/reproduce/joint/worst").glob("*.npz"))[0]
-        shutil.copy(worst, folder / "episode.npz")
-        _runs.append(folder)
-    return _runs[0]
+    shared = Path(os.environ[SHARED])
+    folder = shared / "made"
+    with FileLock(shared / "lock"):
+        if not folder.exists():
+            make_runs(shared / "unfinished")
+            (shared / "unfinished").rename(folder)
+    return folder
 
 
-def pytest_unconfigure() -> None:
-    """Removes what `runs` made."""
-    for folder in _runs:
-        shutil.rmtree(folder, ignore_errors=True)
+def make_runs(folder: Path) -> None:
+    """Runs those commands; the whole of them, or a test fails."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for words in (
+        "train --out runs/mine",
+        "reproduce --out runs/reproduce",
+    ):
+        text = io.StringIO()
+        with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+            assert sidestep(words.split(), folder) == 0, text.getvalue()
+    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text), contextlib.chdir(folder):
+        from sidestep.cli import main
+
+        search = "falsify --shield none --attacks edge --episodes 16 --batch 16 --seconds 20 --out found"
+        assert main(search.split()) == 0, text.getvalue()
+    for name in ("first", "none", "game-seed-0", "game-seed-1"):
+        shutil.copytree(folder / "runs/mine", folder / "runs" / name)
+    found = sorted((folder / "found/counterexamples").glob("*.npz"))[0]
+    found.rename(folder / "found.npz")
+    worst = sorted((folder / "runs/reproduce/joint/worst").glob("*.npz"))[0]
+    shutil.copy(worst, folder / "episode.npz")
 
 
 pytest_collect_file = Sybil(
