@@ -70,11 +70,12 @@ def time_figure(runs: Sequence[Run], path: str | Path) -> tuple[Path, Path]:
 
 def _times(run: Run) -> np.ndarray:
     """Time to the target of each training episode, s; the time limit where it was not reached."""
+    scenario = run.scenario
     steps = [
-        episode["steps"] if episode["outcome"] == "reached" else run.scenario.episode_steps
+        episode["steps"] if episode["outcome"] == "reached" else scenario.episode_steps
         for episode in run.metrics
     ]
-    return np.array(steps) * float(run.scenario.control_period)
+    return np.array(steps) * float(scenario.control_period)
 
 
 def _straight(run: Run) -> np.ndarray:
