@@ -122,7 +122,7 @@ def test_a_person_catches_the_robot_without_a_shield(page, address):
     expect(page.locator("#banner")).to_be_hidden(timeout=WAIT)
 
 
-@pytest.mark.parametrize("shield", ["joint", "game"])
+@pytest.mark.parametrize("shield", ["joint", pytest.param("game", marks=pytest.mark.slow)])
 def test_behind_a_shield_that_holds_nobody_catches_it(page, address, shield):
     visit(page, address + BESIDE.format(shield=shield))
     until(page, lambda: seconds(page) > 5.0)

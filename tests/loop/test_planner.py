@@ -99,7 +99,7 @@ def on_the_host(scenario, world, key):
     return np.array([0.1, 0.05])
 
 
-@pytest.mark.parametrize("pursuer", ["random", own, on_the_host])
+@pytest.mark.parametrize("pursuer", [pytest.param("random", marks=pytest.mark.slow), own, on_the_host])
 def test_any_pursuer_can_be_planned_against(pursuer):
     # Each imagined period asks a pursuer on the host for all plans, one by one.
     short = load_scenario("paper", episode_steps=4)

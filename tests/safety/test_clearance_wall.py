@@ -162,6 +162,7 @@ def test_a_very_large_disc_is_a_wall(two_seconds):
     np.testing.assert_allclose(solved.clearance - disc.collision_distance, beyond, atol=0.005)
 
 
+@pytest.mark.slow
 def test_against_a_faster_pursuer_no_distance_does_for_ever():
     """It herds the evader at a steady rate: from the fourth second on each asks for as much more."""
     needed = {}

@@ -80,7 +80,7 @@ def _chase(scenario, shield, pursuer, worlds, periods, announced):
     return tuple(np.asarray(leaf) for leaf in jax.jit(run)(worlds))
 
 
-@pytest.mark.parametrize("name", ["nash", "turn-while-driving"])
+@pytest.mark.parametrize("name", ["nash", pytest.param("turn-while-driving", marks=pytest.mark.slow)])
 def test_a_shield_told_the_coming_wheel_speeds_keeps_clear_and_interferes_less(name):
     scenario, pursuer = load_scenario("paper", obstacle_count=0), make_pursuer(name)
     worlds = jax.vmap(scenario.reset)(jax.random.split(jax.random.key(3), 64))
