@@ -33,7 +33,7 @@ WHOLE = {
     "policy_delay",
     "worlds",
 }
-OTHERS = {"hidden", "replay_action", "bound_values", "filter_gradients"}
+OTHERS = {"hidden", "replay_action", "bound_values", "filter_gradients", "guided"}
 ALL = {field.name for owner in (TD3, TrainingOptions) for field in dataclasses.fields(owner)} - {"algorithm"}
 
 BAD = [
@@ -51,6 +51,7 @@ BAD = [
     *(("hidden", value) for value in ((), (0,), (16, -1), (16.0,), (True,), 16, "16", None, ((16,),))),
     *(("replay_action", value) for value in ("both", "", None, 1, ["proposed"])),
     *((name, value) for name in ("bound_values", "filter_gradients") for value in (1, 0, "true", None)),
+    *(("guided", value) for value in (-0.1, 1.0, math.nan, "0.5", None, True)),
 ]
 
 
@@ -82,8 +83,9 @@ CHANGED = {
     "replay_action": "executed",
     "bound_values": False,
     "filter_gradients": True,
+    "guided": 0.25,
 }
-COMPANIONS = {"filter_gradients": {"replay_action": "executed"}}
+COMPANIONS = {"filter_gradients": {"replay_action": "executed"}, "guided": {"worlds": 8}}
 """Options that make sense only beside others."""
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep import goal_seeking, load_policy, load_pursuer, make_shield
+from sidestep import goal_seeking, load_policy, load_pursuer, make_pursuer, make_shield
 from sidestep._arrays import real
 from sidestep.learning import Actor, LearnedPursuer, train
 from sidestep.learning.players import EVADING, Pursuing, pursuers_view
@@ -148,7 +148,6 @@ def test_a_trained_pursuer_is_kept_and_goes_where_pursuers_go(hunt):
         np.testing.assert_array_equal(ours, theirs)
     config = json.loads((folder / "config.json").read_text())
     assert config["against"] == "goal-seeking"
-    assert config["pursuer"] == "learned"
     with pytest.raises(RunError, match=r"has trained a pursuer.*goes with --pursuer"):
         load_policy(folder)
     with pytest.raises(RunError, match=r"trained a policy for the evader.*train one with --against"):
@@ -187,6 +186,29 @@ def test_a_pursuers_training_is_resumed_bit_for_bit(hunt, small, tmp_path):
     resumed = train(**{**settings, "episodes": 6}, out=out, resume=True, chunk=10)
     assert resumed.metrics == whole.metrics
     assert small.differences(resumed.state.learner, whole.state.learner) == []
+
+
+def test_guided_worlds_are_driven_by_the_strategy_and_the_others_by_the_learner(small):
+    training = small.train(
+        options=small.options(**HUNT, worlds=4, guided=0.5, replay_capacity=512), against="goal-seeking"
+    )
+    scenario, replay = small.scenario(), training.state.replay
+    guide = make_pursuer("turn-then-drive")
+    ask = jax.jit(jax.vmap(lambda world: guide(scenario, world, jax.random.key(0))))
+    driven = np.asarray(replay.transitions.proposed[: int(replay.written)]).reshape(-1, 4, 2)
+    asked = np.asarray(ask(replay.transitions.world))[: int(replay.written)].reshape(-1, 4, 2)
+    np.testing.assert_allclose(driven[:, :2], asked[:, :2], atol=1e-5)
+    assert np.abs(driven[:, 2:] - asked[:, 2:]).max(axis=-1).min() > 1e-5
+
+
+def test_evaders_are_guided_straight_to_their_targets(small):
+    scenario, world = small.scenario(), world_of(3)
+    towards = np.asarray(world.target - world.evader)
+    expected = float(scenario.evader_speed) * towards / np.linalg.norm(towards)
+    np.testing.assert_allclose(EVADING.guide(scenario, None, world, None), expected, rtol=1e-5)
+    for worlds, guided in ((1, 0.5), (4, 0.1), (2, 0.9)):
+        with pytest.raises(ValueError, match="it must take at least one and leave some"):
+            small.options(worlds=worlds, guided=guided)
 
 
 def test_what_a_pursuer_cannot_learn_from_is_refused(small):

@@ -15,7 +15,6 @@ from sidestep.commands.common import (
     ScenarioName,
     ShieldName,
     TrainingBar,
-    given,
     going_on,
     options_from,
     parse_overrides,
@@ -58,7 +57,8 @@ class Train:
     warm_start: Path | None = None
     """Run folder whose networks the training begins with, such as one behind a cheaper shield."""
     against: PolicyOption | None = None
-    """Train a pursuer instead, against an evader that drives by this policy behind the shield."""
+    """Train a pursuer instead, against an evader that drives by this policy behind the shield; --pursuer then
+    drives the guided worlds."""
     vary: Overrides = ()
     """Scenario fields that every episode draws anew, such as capture_distance=[0.1,0.2] obstacle_count=[0,5];
     see the documentation for which."""
@@ -82,8 +82,6 @@ def run(command: Train, console: Console) -> int:
             command, "shield", "pursuer", "seed", "episodes", "warm_start", "against", stored=stored
         )
         settings["vary"] = parse_overrides(command.vary) or settings.get("vary")
-        if settings["against"] is not None and given(command, "pursuer"):
-            raise ValueError("--against trains the pursuer itself: leave out --pursuer")
         settings["scenario"] = scenario_from(command, settings.get("scenario"))
         settings["options"] = options_from(command, settings.get("options"))
         with TrainingBar(console, f"training, {settings['shield']}") as show:

@@ -24,6 +24,8 @@ class TrainingOptions(eqx.Module):
     - `batch_size`, `updates_per_decision`, `warmup_decisions` (of all worlds, uniformly random before any
       update).
     - `exploration_noise`: standard deviation, in units of the action range.
+    - `guided`: share of the worlds that a fixed strategy drives, for the learner to learn from: straight to
+      the target, or where a pursuer learns, the training's `pursuer`.
     - `hindsight`: share of each batch whose target is replaced by a position reached later.
     - `mirror`: share of each batch reflected left to right.
     - `reward_scale`: multiplies rewards inside the learner only; reported returns are the paper's.
@@ -52,6 +54,7 @@ class TrainingOptions(eqx.Module):
     time_cost: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0, unit="1/s"))
     mirror: Scalar = eqx.field(converter=real, default=0.5, metadata=within(least=0.0, most=1.0))
     anneal: Scalar = eqx.field(converter=real, default=0.0, metadata=within(least=0.0, most=1.0))
+    guided: float = static_field(0.0, least=0.0, below=1.0)
     bound_values: bool = eqx.field(static=True, default=True)
     replay_action: str = static_field("proposed", one_of("proposed", "executed"))
     filter_gradients: bool = eqx.field(static=True, default=False)
@@ -73,6 +76,11 @@ class TrainingOptions(eqx.Module):
         return eqx.tree_at(rates, self, tuple(share * rate for rate in rates(self)))
 
     def __check_init__(self) -> None:
+        if self.guided > 0.0 and round(self.guided * self.worlds) not in range(1, self.worlds):
+            raise ValueError(
+                f"training option 'guided' = {self.guided:g}: of worlds={self.worlds} it must take at least "
+                "one and leave some to the policy; use more worlds"
+            )
         if self.filter_gradients and self.replay_action != "executed":
             raise ValueError(
                 f"training option 'filter_gradients' = True: it needs replay_action='executed', not "

@@ -18,9 +18,9 @@ from sidestep.learning.networks import Actor
 from sidestep.learning.options import TrainingOptions
 from sidestep.learning.td3 import Bound, no_bound
 from sidestep.loop.episode import Episode, Period, Task, advance, hold
-from sidestep.loop.policies import as_policy
+from sidestep.loop.policies import GOAL_SEEKING, as_policy
 from sidestep.loop.step import decide, decision_steps_of, nominal_velocity
-from sidestep.pursuit import Pursuer
+from sidestep.pursuit import Pursuer, pursue
 from sidestep.world import Scenario, World, observation_size, observe, to_action
 from sidestep.world.capture_geometry import to_pursuer_axes, to_pursuer_frame
 from sidestep.world.observation import NEAR_ROBOT
@@ -73,6 +73,10 @@ class Player(eqx.Module):
     ) -> tuple[Episode, Period]:
         """One control period with the command held; `pursuer` as for a `Task`, unless that is who learns."""
 
+    @abc.abstractmethod
+    def guide(self, scenario: Scenario, pursuer: Any, world: World, key: Any) -> Float[Array, "2 *lanes"]:
+        """The command of the strategy that `guided` worlds are driven by; one `key` per lane."""
+
     @property
     @abc.abstractmethod
     def bound(self) -> Bound:
@@ -120,6 +124,9 @@ class Evading(Player):
     ) -> tuple[Episode, Period]:
         task = Task(scenario, None, shield, pursuer)
         return advance(task, hold(episode, command), key)
+
+    def guide(self, scenario: Scenario, pursuer: Any, world: World, key: Any) -> Float[Array, "2 *lanes"]:
+        return decide(scenario, as_policy(GOAL_SEEKING, scenario), world)
 
     @property
     def bound(self) -> Bound:
@@ -205,6 +212,9 @@ class Pursuing(Player):
         )
         episode = hold(episode, jnp.where(due, wanted, episode.nominal))
         return advance(Task(scenario, None, shield, _Held(command)), episode, key)
+
+    def guide(self, scenario: Scenario, pursuer: Any, world: World, key: Any) -> Float[Array, "2 *lanes"]:
+        return pursue(scenario, pursuer, world, key)[0]
 
     @property
     def bound(self) -> Bound:

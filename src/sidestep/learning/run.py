@@ -165,9 +165,9 @@ def train(
     checkpoint and an empty replay: for another shield, pursuer or scenario with equal observations.
 
     With `against`, a run folder, `pretrained` or `goal-seeking`, the pursuer learns, and the evader drives by
-    that policy behind the shield (see `Pursuing`); `pursuer` has no effect then. With `vary`, such as
-    `{"capture_distance": [0.1, 0.2], "obstacle_count": [0, 5]}`, every episode draws its own robots (see
-    `Variation`).
+    that policy behind the shield (see `Pursuing`); `pursuer` then drives the `guided` worlds. With `vary`,
+    such as `{"capture_distance": [0.1, 0.2], "obstacle_count": [0, 5]}`, every episode draws its own robots
+    (see `Variation`).
 
     The folder is locked until the last file is written. A run that has all its episodes is not changed. A
     damaged checkpoint is skipped with a `DamageWarning`.
@@ -183,7 +183,7 @@ def train(
     options = make_options() if options is None else options
     player: Player = EVADING
     if against is not None:
-        against, pursuer, options = str(against), "learned", Pursuing.options(options)
+        against, options = str(against), Pursuing.options(options)
         player = Pursuing.against(against if against == "goal-seeking" else load_policy(against), scenario)
     if chunk is None:
         chunk = CHUNK if options.worlds == 1 else CHUNK_OF_MANY
@@ -191,10 +191,7 @@ def train(
     names = {"shield": _name(shield), "pursuer": _name(pursuer)}
     shield = as_shield(shield, scenario)
     variation, scenario, shield = Variation.of(vary or {}, scenario, shield)
-    if player is not EVADING:
-        pursuer = None
-    else:
-        pursuer = load_pursuer(pursuer) if isinstance(pursuer, str) else as_pursuer(pursuer)
+    pursuer = load_pursuer(pursuer) if isinstance(pursuer, str) else as_pursuer(pursuer)
     capacity = _capacity(options, scenario, episodes)
     config = {
         "scenario": scenario_to_dict(scenario),

@@ -116,6 +116,16 @@ class Course(eqx.Module):
 
         return self.inside(command, drawn, world, action)
 
+    def guide(
+        self, drawn: Float[Array, "varied *lanes"], world: World, key: PRNGKeyArray
+    ) -> Float[Array, "2 *lanes"]:
+        """The command (m/s) of the strategy that drives the `guided` worlds."""
+
+        def guide(scenario: Scenario, shield: Any, world: World, key: Any) -> Array:
+            return self.player.guide(scenario, self.pursuer, world, key)
+
+        return self.inside(guide, drawn, world, jax.random.split(key, self.options.worlds))
+
     def speed(self, drawn: Float[Array, "varied *lanes"], world: World) -> Lanes:
         """The evader's speed (m/s)."""
 
@@ -253,6 +263,9 @@ def decide_and_learn(
     # A learner that another training has begun does not start with random actions.
     begun = state.learner.updates > 0
     command = course.command(drawn, world, jnp.where(warm & ~begun, anything, explored))
+    if options.guided > 0.0:
+        led = jnp.arange(options.worlds) < round(options.guided * options.worlds)
+        command = jnp.where(led, course.guide(drawn, world, jax.random.fold_in(drive_key, 0)), command)
 
     drive = _drive(course, state, command, drive_key)
     end, steps = drive.end, drive.end.tally.steps - state.episode.tally.steps
