@@ -119,10 +119,12 @@ class Course(eqx.Module):
     def guide(
         self, drawn: Float[Array, "varied *lanes"], world: World, key: PRNGKeyArray
     ) -> Float[Array, "2 *lanes"]:
-        """The command (m/s) of the strategy that drives the `guided` worlds."""
+        """The command (m/s) of the strategy that drives the `guided` worlds, which decides as seldom."""
 
         def guide(scenario: Scenario, shield: Any, world: World, key: Any) -> Array:
-            return self.player.guide(scenario, self.pursuer, world, key)
+            seldom = self.options.decision_steps * scenario.control_period
+            paced = eqx.tree_at(lambda scenario: scenario.control_period, scenario, seldom)
+            return self.player.guide(paced, self.pursuer, world, key)
 
         return self.inside(guide, drawn, world, jax.random.split(key, self.options.worlds))
 
