@@ -192,7 +192,7 @@ def test_guided_worlds_are_driven_by_the_strategy_and_the_others_by_the_learner(
     training = small.train(
         options=small.options(**HUNT, worlds=4, guided=0.5, replay_capacity=512), against="goal-seeking"
     )
-    scenario, replay = small.scenario(), training.state.replay
+    replay = training.state.replay
     # It decides as seldom as the learner, so that it does not turn too far.
     guide, paced = make_pursuer("turn-then-drive"), small.scenario(control_period=0.1)
     ask = jax.jit(jax.vmap(lambda world: guide(paced, world, jax.random.key(0))))
