@@ -86,6 +86,7 @@ ATTACKS: dict[str, Any] = {
     "reverser": Reverser,
     "saddle": lambda: JointSaddle(None, jnp.zeros(2)),
     "jitter": Jitter,
+    "hunter": lambda: load_pursuer("hunter"),
 }
 """The attacking pursuers by name; `saddle` lowers the barrier, or what is left to the obstacle, as far as one
 period allows, and knows the evader's velocity."""

@@ -11,7 +11,7 @@ import pytest
 
 from sidestep import goal_seeking, load_policy, load_pursuer, make_pursuer, make_shield
 from sidestep._arrays import real
-from sidestep.learning import Actor, LearnedPursuer, train
+from sidestep.learning import HUNTER, Actor, LearnedPursuer, policy_file, train
 from sidestep.learning.players import EVADING, Pursuing, pursuers_view
 from sidestep.learning.replay import mirror_world, sample
 from sidestep.learning.variation import VARIED, Variation
@@ -160,6 +160,26 @@ def _evaders(folder):
 
     (folder.parent / "evader").mkdir(exist_ok=True)
     return write_policy(folder.parent / "evader", LearnedPolicy(load_pursuer(folder).actor, 2))
+
+
+def test_the_pursuer_that_comes_with_the_package_fits_its_scenario_and_ships_small():
+    assert policy_file(HUNTER).stat().st_size < 2_000_000
+    world = dataclasses.replace(world_of(4), obstacles=jnp.ones((1, 4)))
+    wheels = load_pursuer(HUNTER)(load_scenario("paper"), world, jax.random.key(0))
+    assert np.abs(wheels).max() <= 0.2 + 1e-6
+
+
+@pytest.mark.slow
+def test_it_delays_the_policy_that_it_has_learned_against():
+    from sidestep.trials import evaluate
+
+    scenario = load_scenario("paper", observation="motion", episode_steps=2400)
+    policy, pursuers = load_policy("pretrained"), (HUNTER, "turn-then-drive", "nash")
+    means = [
+        np.mean(evaluate(scenario, policy, "joint:table", load_pursuer(name), 256, 1).times_to_target)
+        for name in pursuers
+    ]
+    assert means[0] > 1.2 * means[1] > 1.2 * means[2]
 
 
 def test_names_of_pursuers_can_be_joined(hunt):

@@ -37,8 +37,8 @@ class Evaluate:
     shield: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Shield: none, paper, game or joint; the run's own, or joint, by default."""
     pursuer: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Pursuer strategy, run folder of a trained one, or several joined by +; the run's own, or nash, by
-    default."""
+    """Pursuer strategy, hunter or the run folder of another trained one, or several joined by +; by default
+    the run's own, or nash."""
     episodes: int = bounded(1000, EPISODES)
     """Episodes to measure."""
     seed: int = bounded(0, SEED)

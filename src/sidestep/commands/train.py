@@ -44,8 +44,8 @@ class Train:
     """Shield during training: none, paper, game or joint."""
     pursuer: PursuerName = unless_given("nash")
     """Pursuer: nash, turn-then-drive, turn-while-driving, pure-pursuit, interceptor, random, still; mixed,
-    one after another; chauffeur for robots that cannot turn on the spot; the run folder of a trained one; or
-    several joined by +, such as mixed+runs/hunter."""
+    one after another; chauffeur for robots that cannot turn on the spot; hunter, a trained one; the run
+    folder of another; or several joined by +, such as mixed+hunter."""
     episodes: int = bounded(unless_given(200), EPISODES)
     """Training episodes; with --resume the new total, if larger."""
     seed: int = bounded(unless_given(0), SEED)
