@@ -13,6 +13,7 @@ from sidestep import goal_seeking, load_policy, load_pursuer, make_pursuer, make
 from sidestep._arrays import real
 from sidestep.learning import HUNTER, Actor, LearnedPursuer, policy_file, train
 from sidestep.learning.players import EVADING, Pursuing, pursuers_view
+from sidestep.learning.policy import from_anywhere
 from sidestep.learning.replay import mirror_world, sample
 from sidestep.learning.variation import VARIED, Variation
 from sidestep.pursuit import CaptureGame, Mixed
@@ -180,6 +181,15 @@ def test_it_delays_the_policy_that_it_has_learned_against():
         for name in pursuers
     ]
     assert means[0] > 1.2 * means[1] > 1.2 * means[2]
+
+
+def test_a_run_names_its_opponents_so_that_it_can_be_resumed_from_anywhere(hunt, monkeypatch):
+    folder, _ = hunt
+    monkeypatch.chdir(folder.parent)
+    # The folder is called hunter, too: the shipped one goes first.
+    assert folder.name == "hunter"
+    assert from_anywhere("mixed+hunter+./hunter") == f"mixed+hunter+{folder}"
+    assert from_anywhere("goal-seeking") == "goal-seeking"
 
 
 def test_names_of_pursuers_can_be_joined(hunt):

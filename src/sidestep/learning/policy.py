@@ -120,6 +120,16 @@ def load_pursuer(name: str | Path) -> Pursuer:
     return Mixed(tuple(strategies))
 
 
+def from_anywhere(names: str) -> str:
+    """The names of policies or pursuers, joined by `+`, with absolute paths for those that are paths."""
+    shipped = {PRETRAINED, HUNTER, *PURSUERS, *CHAUFFEURS, *MIXTURES}
+    whole = [
+        str(Path(name).absolute()) if name not in shipped and Path(name).exists() else name
+        for name in names.split("+")
+    ]
+    return "+".join(whole)
+
+
 def _pursuer(name: str) -> Pursuer:
     known = PURSUERS | CHAUFFEURS | MIXTURES
     if name != HUNTER and (name in known or not Path(name).exists()):

@@ -21,10 +21,19 @@ from sidestep.learning.curves import Curves
 from sidestep.learning.divergence import Diverged, check_networks, divergence
 from sidestep.learning.options import TrainingOptions, make_options, options_to_dict
 from sidestep.learning.players import EVADING, LearnedPursuer, Player, Pursuing
-from sidestep.learning.policy import LearnedPolicy, load_policy, load_pursuer, load_trained, write_policy
+from sidestep.learning.policy import (
+    LearnedPolicy,
+    from_anywhere,
+    load_policy,
+    load_pursuer,
+    load_trained,
+    write_policy,
+)
 from sidestep.learning.td3 import Learner
 from sidestep.learning.training import Report, TrainState, run_chunk, start
 from sidestep.learning.variation import Variation
+from sidestep.loop.episode import straight_times
+from sidestep.loop.policies import GOAL_SEEKING
 from sidestep.pursuit import as_pursuer
 from sidestep.safety import as_shield
 from sidestep.store import runs as records
@@ -87,8 +96,7 @@ def _episode_lines(scenario: Scenario, report: Report, done: int) -> list[dict[s
     """The lines of `metrics.jsonl` for the episodes that ended in a chunk."""
     ended = np.nonzero(np.asarray(report.ended))
     tally = jax.tree.map(lambda leaf: np.asarray(leaf)[ended], report.tally)
-    way = np.maximum(tally.distance - np.asarray(scenario.reach_distance), 0.0)
-    straight = way / np.asarray(report.evader_speed)[ended]
+    straight = straight_times(scenario, tally.distance, np.asarray(report.evader_speed)[ended])
     outcome, env_steps = np.asarray(report.outcome)[ended], np.asarray(report.env_steps)[ended[0]]
     return [
         json_safe(
@@ -181,17 +189,19 @@ def train(
     whole_number("episodes", episodes)
     seed_number(seed)
     options = make_options() if options is None else options
-    player: Player = EVADING
-    if against is not None:
-        against, options = str(against), Pursuing.options(options)
-        player = Pursuing.against(against if against == "goal-seeking" else load_policy(against), scenario)
+    options = options if against is None else Pursuing.options(options)
     if chunk is None:
         chunk = CHUNK if options.worlds == 1 else CHUNK_OF_MANY
     whole_number("chunk", chunk)
+    pursuer = from_anywhere(pursuer) if isinstance(pursuer, str) else pursuer
     names = {"shield": _name(shield), "pursuer": _name(pursuer)}
     shield = as_shield(shield, scenario)
     variation, scenario, shield = Variation.of(vary or {}, scenario, shield)
     pursuer = load_pursuer(pursuer) if isinstance(pursuer, str) else as_pursuer(pursuer)
+    player: Player = EVADING
+    if against is not None:
+        against = from_anywhere(str(against))
+        player = Pursuing.against(against if against == GOAL_SEEKING else load_policy(against), scenario)
     capacity = _capacity(options, scenario, episodes)
     config = {
         "scenario": scenario_to_dict(scenario),

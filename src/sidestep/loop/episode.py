@@ -103,11 +103,13 @@ class Tally(eqx.Module):
         )
 
 
-def straight_times(scenario: Scenario, distances: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Times (s) straight to targets at these distances (m) at full speed, which no policy can beat."""
-    return np.maximum(distances - np.asarray(scenario.reach_distance), 0.0) / np.asarray(
-        scenario.evader_speed
-    )
+def straight_times(
+    scenario: Scenario, distances: Float[np.ndarray, "n"], speeds: Float[np.ndarray, "n"] | None = None
+) -> Float[np.ndarray, "n"]:
+    """Times (s) straight to targets at these distances (m) at full speed, the scenario's or these (m/s).
+    No policy can beat them."""
+    full = np.asarray(scenario.evader_speed) if speeds is None else speeds
+    return np.maximum(distances - np.asarray(scenario.reach_distance), 0.0) / full
 
 
 class Episode(eqx.Module):
