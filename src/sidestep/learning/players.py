@@ -63,15 +63,9 @@ class Player(eqx.Module):
 
     @abc.abstractmethod
     def advance(
-        self,
-        scenario: Scenario,
-        shield: Any,
-        pursuer: Any,
-        episode: Episode,
-        command: Float[Array, "2 *lanes"],
-        key: Any,
+        self, task: Task, episode: Episode, command: Float[Array, "2 *lanes"], key: Any
     ) -> tuple[Episode, Period]:
-        """One control period with the command held; `pursuer` as for a `Task`, unless that is who learns."""
+        """One control period of the task with the command held."""
 
     @abc.abstractmethod
     def guide(self, scenario: Scenario, pursuer: Any, world: World, key: Any) -> Float[Array, "2 *lanes"]:
@@ -114,15 +108,8 @@ class Evading(Player):
         return evaders
 
     def advance(
-        self,
-        scenario: Scenario,
-        shield: Any,
-        pursuer: Any,
-        episode: Episode,
-        command: Float[Array, "2 *lanes"],
-        key: Any,
+        self, task: Task, episode: Episode, command: Float[Array, "2 *lanes"], key: Any
     ) -> tuple[Episode, Period]:
-        task = Task(scenario, None, shield, pursuer)
         return advance(task, hold(episode, command), key)
 
     def guide(self, scenario: Scenario, pursuer: Any, world: World, key: Any) -> Float[Array, "2 *lanes"]:
@@ -196,22 +183,16 @@ class Pursuing(Player):
         return scenario.reach_reward * lost - evaders
 
     def advance(
-        self,
-        scenario: Scenario,
-        shield: Any,
-        pursuer: Any,
-        episode: Episode,
-        command: Float[Array, "2 *lanes"],
-        key: Any,
+        self, task: Task, episode: Episode, command: Float[Array, "2 *lanes"], key: Any
     ) -> tuple[Episode, Period]:
         due = episode.tally.steps % decision_steps_of(self.policy) == 0
         wanted = jax.lax.cond(
             jnp.any(due),
-            lambda: decide(scenario, self.policy, episode.world),
+            lambda: decide(task.scenario, self.policy, episode.world),
             lambda: episode.nominal,
         )
         episode = hold(episode, jnp.where(due, wanted, episode.nominal))
-        return advance(Task(scenario, None, shield, _Held(command)), episode, key)
+        return advance(Task(task.scenario, None, task.shield, _Held(command)), episode, key)
 
     def guide(self, scenario: Scenario, pursuer: Any, world: World, key: Any) -> Float[Array, "2 *lanes"]:
         return pursue(scenario, pursuer, world, key)[0]

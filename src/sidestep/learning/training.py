@@ -18,7 +18,7 @@ from sidestep.learning.players import EVADING, Player
 from sidestep.learning.replay import Replay, Transition, sample
 from sidestep.learning.td3 import Bound, Learner, Losses, update
 from sidestep.learning.variation import FIXED, Variation
-from sidestep.loop.episode import Episode, Period, Tally, begin
+from sidestep.loop.episode import Episode, Period, Tally, Task, begin
 from sidestep.loop.step import CAPTURED, COLLIDED
 from sidestep.world import Scenario, World
 
@@ -189,7 +189,7 @@ def _drive(course: Course, state: TrainState, command: Float[Array, "2 *lanes"],
     def advance(
         scenario: Scenario, shield: Any, episode: Episode, command: Array, key: Any
     ) -> tuple[Episode, Period]:
-        return course.player.advance(scenario, shield, course.pursuer, episode, command, key)
+        return course.player.advance(Task(scenario, None, shield, course.pursuer), episode, command, key)
 
     def period(carry: tuple[Episode, Array, Array], key: Key[Array, "*lanes"]) -> tuple[Any, Array]:
         episode, *sums = carry

@@ -57,7 +57,7 @@ class Variation(eqx.Module):
             for end in ends:
                 value = [float(end), 0.0] if name == _DRIFT else end
                 taken(f"the range of {name}", value, rules[name])
-        if ranges and not scenario.built_in:
+        if ranges:
             scenario.check_built_in("a training with varied robots", "vary the models in your own training")
         if ranges and not isinstance(shield, _SERVED):
             raise ValueError(

@@ -21,6 +21,7 @@ Pursuers and obstacles are sorted, nearest first, so their order in the world ha
 action is in [-1, 1]^2 in the same axes; the velocity is v_e times the action, its norm clipped to 1.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -102,9 +103,10 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
         extra: Callable[[Any], tuple[Lanes, Lanes]],
         contact: Scalar,
         more: Callable[[Any], list[Lanes]] = lambda robot: [],
+        reach: float = math.inf,
     ) -> list[Lanes]:
         """Entries of all robots of a kind; `extra` gives each robot's second vector, in world axes, and
-        `more` what comes last."""
+        `more` what comes last. Those of robots beyond `reach` (m) are 0."""
         distances = [length(robot[0] - world.evader[0], robot[1] - world.evader[1]) for robot in robots]
         if len(distances) > 1:
             order = jnp.argsort(jnp.stack(distances), axis=0)
@@ -113,10 +115,15 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
         entries = []
         for robot, distance in zip(robots, distances, strict=True):
             squash = 1.0 / (1.0 + distance)
-            entries += along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash)
-            entries += along(*extra(robot))
-            entries.append(jnp.exp(-jnp.maximum(distance - contact, 0.0) / NEAR_ROBOT))
-            entries += more(robot)
+            mine = [
+                *along((robot[0] - world.evader[0]) * squash, (robot[1] - world.evader[1]) * squash),
+                *along(*extra(robot)),
+                jnp.exp(-jnp.maximum(distance - contact, 0.0) / NEAR_ROBOT),
+                *more(robot),
+            ]
+            if reach < math.inf:
+                mine = [jnp.where(distance < reach, entry, 0.0) for entry in mine]
+            entries += mine
         return entries
 
     def heading(robot: Any) -> tuple[Lanes, Lanes]:
@@ -132,18 +139,11 @@ def observe(scenario: Scenario, world: World) -> Float[Array, "observation *lane
     if scenario.observation != "poses":
         pursuers = jnp.concatenate([pursuers, world.wheel_speeds], axis=1)
     entries += block(pursuers, heading, scenario.capture_distance, wheels)
-    obstacles = block(world.obstacles, drift, scenario.collision_distance)
-    if scenario.observation == "robots":
-        # Sorted, nearest first, of five entries each.
-        seen = jnp.sort(_distances(world), axis=0) < _SEEN
-        shown = [jnp.where(seen[i // 5], entry, 0.0) for i, entry in enumerate(obstacles[: 5 * _SLOTS])]
-        obstacles = shown + [jnp.zeros_like(distance)] * (5 * _SLOTS - len(shown)) + _robots(scenario)
-    return stack(*entries, *obstacles)
-
-
-def _distances(world: World) -> Float[Array, "k *lanes"]:
-    """From the evader to each obstacle, m."""
-    return length(world.obstacles[:, 0] - world.evader[0], world.obstacles[:, 1] - world.evader[1])
+    if scenario.observation != "robots":
+        return stack(*entries, *block(world.obstacles, drift, scenario.collision_distance))
+    shown = block(world.obstacles, drift, scenario.collision_distance, reach=_SEEN)[: 5 * _SLOTS]
+    missing = [jnp.zeros_like(distance)] * (5 * _SLOTS - len(shown))
+    return stack(*entries, *shown, *missing, *_robots(scenario))
 
 
 def _robots(scenario: Scenario) -> list[Scalar]:
